@@ -50,7 +50,7 @@ LONG = (
     *("tune/test_tune.py", "browsers", "config/test_recipes.py", "tune/test_tune_parts.py"),
     *("commands/test_hostile_runs.py", "commands/test_bad_input.py", "config/test_config.py"),
     *("engine/test_populations.py", "api/test_certificates.py", "report/test_report.py"),
-    *("commands/test_commands.py", "process/test_output.py", "restore/test_resume_kills.py"),
+    *("commands/test_commands.py", "process/test_output.py"),
     *("diagnosis/test_sabotage.py", "restore/test_reproduce.py", "restore/test_resume.py"),
     *("checking/test_check.py", "restore/test_resume_commands.py", "commands/test_train_on_worlds.py"),
     *("commands/test_benchmark.py", "export/test_export.py", "training/test_training.py"),

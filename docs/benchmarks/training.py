@@ -17,7 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env as dummy_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
-from gridworld.agents import Learning, family, learn_together
+from gridworld.agents import Learning, learn_together
 from gridworld.envs.observations import OneHotObservation
 from gridworld.training.setup import make_context
 from gridworld.world.mdp import Mdp
@@ -113,7 +113,7 @@ def steps_per_second(commands: Sequence[Sequence[str]], mdp: Mdp | None = None) 
         config = compose(words)
         world = mdp or config.env.compile()
         context = make_context(config, world)
-        agent = family(config.agent).build(config.agent, context)
+        agent = config.agent.build(context)
         learnings.append(Learning(agent, config.total_timesteps, partial(_note, made, number)))
     started = time.perf_counter()
     errors = [error for error in learn_together(learnings) if error is not None]

@@ -35,11 +35,10 @@ from gridworld.restore.saved_run import SavedRun, read_visits
 from gridworld.run import summary as run_summary
 from gridworld.run.folder import claimed
 from gridworld.run.reader import check_free, is_started
-from gridworld.training.pictures import PictureSubject
 from gridworld.training.setup import without_pictures
 from gridworld.training.train import train as train_in
 from gridworld.visualization.files import encode_png
-from gridworld.visualization.picture import drawer
+from gridworld.visualization.picture import Subject, drawer
 from gridworld.world.evaluation import Evaluator
 
 if TYPE_CHECKING:  # of most runs nothing is drawn
@@ -130,8 +129,8 @@ class RunResult:
         """Draw its values and greedy actions, as in `policy.png`, as a picture of Pillow; cells in pixels."""
         from PIL import Image
 
-        shown = self.config, False, self.evaluator, self.policy, self.summary["timesteps"], self.visits, None
-        return Image.fromarray(cast(Frame, drawer("maps.policy")(PictureSubject(*shown))(cell_size)))
+        shown = self.config, False, self.evaluator, self.policy, self.summary["timesteps"], self.visits
+        return Image.fromarray(cast(Frame, drawer("maps.policy")(Subject(*shown))(cell_size)))
 
     def _repr_html_(self) -> str:
         """Its verdict, learning curve and policy."""

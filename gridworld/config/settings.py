@@ -54,7 +54,7 @@ def agent_schemas() -> dict[str, type[AgentConfig]]:
     found: dict[str, type[AgentConfig]] = {}
     agents = importlib.import_module("gridworld.agents")
     for family in pkgutil.iter_modules(agents.__path__):
-        found |= importlib.import_module(f"{agents.__name__}.{family.name}").schemas()
+        found |= importlib.import_module(f"{agents.__name__}.{family.name}").SCHEMAS
     return found
 
 

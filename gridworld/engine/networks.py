@@ -7,9 +7,10 @@ in the same order. Rows begin at multiples of 64 bytes, as tensors of their own 
 
 from __future__ import annotations
 
+import copy
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Literal, cast
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, Self, cast
 
 import numpy as np
 import torch
@@ -46,13 +47,6 @@ def cut(vectors: Tensor, shapes: Sequence[torch.Size]) -> list[Tensor]:
     """Views (..., *shape) of vectors (..., W), one behind the other."""
     parts = torch.split(vectors, [shape.numel() for shape in shapes], dim=-1)
     return [part.view(*part.shape[:-1], *shape) for part, shape in zip(parts, shapes, strict=True)]
-
-
-def copy_row(row: Tensor, parameters: Sequence[Tensor]) -> None:
-    """Copy a row (W,) of weights into parameters of these shapes."""
-    parts = cut(row, [parameter.shape for parameter in parameters])
-    for parameter, part in zip(parameters, parts, strict=True):
-        parameter.data.copy_(part)  # which may be a view of the row, and leaves a graph as it is
 
 
 class _Rows:
@@ -142,19 +136,19 @@ class DenseNetworks(_Rows):
         return [[(views[weight], views[bias]) for weight, bias in pairs] for pairs in self._places]
 
     @staticmethod
-    def fit(nets: Iterable[Sequence[nn.Module]], parameters: Sequence[Tensor]) -> bool:
-        """Whether networks are made of such layers alone, and have no other parameters."""
-        layers = [layer for net in nets for layer in net]
+    def fit(network: StateNetwork) -> bool:
+        """Whether a network is made of such layers alone, and has no other parameters."""
+        layers = [layer for net in network.layers for layer in net]
         linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
         kinds = {type(layer) for layer in layers} - {nn.Linear}
         own = {id(each) for layer in linear for each in (layer.weight, layer.bias)}
         alternate = all(
             isinstance(layer, nn.Linear) == (place % 2 == 0)
-            for net in nets
+            for net in network.layers
             for place, layer in enumerate(net)
         )
         known = len(kinds) <= 1 and kinds <= _FORWARD.keys()
-        return known and alternate and own == {id(each) for each in parameters}
+        return known and alternate and own == {id(each) for each in network.parameters}
 
     def run(self, states: IntArray | None = None) -> tuple[Array, ...]:
         """Outputs (P, U, n) of states (U,), only where P is 1, or of all; the next run may overwrite them."""
@@ -306,8 +300,8 @@ class ModuleNetworks(_Rows):
 Networks = DenseNetworks | ModuleNetworks
 
 
-class Inputs:
-    """Feeds a policy's networks with states.
+class StateNetwork:
+    """A network of SB3's policy, or its target network, which sees states.
 
     Features that no parameter has a part in are a table, made once. So are the distinct squares of pixels of
     all images, which is what a network begins with that learns from pixels. A one-hot row times the first
@@ -316,7 +310,8 @@ class Inputs:
     Args:
         policy: the policy.
         observation: what it sees of a state.
-        nets: the layers of each of its outputs.
+        layers: those of each output, behind the features.
+        parameters: its own, in the order of its optimiser and of a row.
         extractors: the modules that make features of observations, one, or one for each output.
         extract: makes features of observations (U, *shape): a tensor, or one for each output.
     """
@@ -325,19 +320,27 @@ class Inputs:
         self,
         policy: BasePolicy,
         observation: ObservationTable,
-        nets: Sequence[Sequence[nn.Module]],
+        layers: Sequence[Sequence[nn.Module]],
+        parameters: Sequence[nn.Parameter],
         extractors: Sequence[Any],
         extract: Callable[[Tensor], Any],
     ) -> None:
-        self._policy, self._observation, self._nets = policy, observation, nets
+        self.layers, self.parameters = layers, parameters
+        self._policy, self._observation, self._outputs = policy, observation, slice(None)
         self._extractors, self._extract = extractors, extract
         kinds = {_kind(each) for each in extractors}
         kind = kinds.pop() if len(kinds) == 1 else "any"
-        begin_linear = all(len(net) > 0 and isinstance(net[0], nn.Linear) for net in nets)
+        begin_linear = all(len(net) > 0 and isinstance(net[0], nn.Linear) for net in layers)
         self.is_look_up = kind == "flat" and begin_linear and _is_one_hot(observation)
         self._is_fixed = kind in ("flat", "fixed")
         self._is_learned = kind == "patches"
         self._all: Any = None  # of all states, the features if these never change, else the observations
+
+    def part(self, outputs: slice, parameters: Sequence[nn.Parameter]) -> Self:
+        """The part of it that makes some of its outputs with these parameters."""
+        part = copy.copy(self)
+        part.layers, part.parameters, part._outputs = self.layers[outputs], parameters, outputs
+        return part
 
     def rows(self, states: IntArray) -> NDArray[Any]:
         """The observations (U, *shape) of states (U,)."""
@@ -358,10 +361,10 @@ class Inputs:
     def forward(self, states: IntArray | None) -> tuple[Tensor, ...]:
         """Run the policy's own modules on states (U,), or on all: (U, n) of each output, with its graph."""
         if self.is_look_up:
-            return tuple(_look_up(*net, states=states) for net in self._nets)
+            return tuple(_look_up(*net, states=states) for net in self.layers)
         features = self._features(states)
-        given = features if isinstance(features, tuple) else (features,) * len(self._nets)
-        return tuple(_run(net, each) for net, each in zip(self._nets, given, strict=True))
+        given = features[self._outputs] if isinstance(features, tuple) else (features,) * len(self.layers)
+        return tuple(_run(net, each) for net, each in zip(self.layers, given, strict=True))
 
     def _features(self, states: IntArray | None) -> Any:
         if states is not None:
@@ -394,9 +397,18 @@ class Inputs:
         return cast(Tensor, tensor)
 
 
+def make_networks(networks: Sequence[StateNetwork], met: IntArray | None = None) -> Networks:
+    """Those of P policies at once, with the weights that SB3's models have; see `DenseNetworks` for `met`."""
+    first, table = networks[0], networks[0].table()
+    vectors = [torch.cat([each.detach().reshape(-1) for each in own.parameters]) for own in networks]
+    if DenseNetworks.fit(first) and (first.is_look_up or table is not None):
+        return DenseNetworks(torch.stack(vectors), first.parameters, first.layers, table, met)
+    assert len(networks) == 1
+    return ModuleNetworks(vectors[0], first.parameters, first.forward)
+
+
 def _kind(extractor: Any) -> Kind:
-    kind: Kind = "flat" if type(extractor) is FlattenExtractor else getattr(extractor, "kind", "any")
-    return kind
+    return "flat" if type(extractor) is FlattenExtractor else getattr(extractor, "kind", "any")
 
 
 def _is_one_hot(observation: ObservationTable) -> bool:

@@ -22,7 +22,7 @@ from gridworld.run.reader import LARGEST_RESULT, RunReader
 
 _FALLS = 0.95  # of the regret in the quarter of the curve before the last
 _FEWEST = 8  # evaluations
-_WHY = "what it costs, and why:"
+_WHY = "why it is not optimal:"
 _REPLACED = ("total_timesteps", "n_envs", "preset", "tuned")
 
 

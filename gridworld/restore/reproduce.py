@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 
-from gridworld.agents import family
 from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
@@ -179,7 +178,7 @@ def compare(then: RunReader, now: RunReader, config: TrainConfig, mdp: Mdp) -> I
     """Compare two finished runs of one configuration in one world, part by part of the result."""
 
     def weights(path: Path, most: int) -> Entries:
-        return sorted(family(config.agent).weights(path, most).items())
+        return sorted(config.agent.weights(path, most).items())
 
     def visits(run: RunReader) -> Entries:
         counts = read_visits(run, mdp.probability.shape[:2])

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import Agent, PolicySnapshot, family
+from gridworld.agents import Agent, PolicySnapshot
 from gridworld.config.settings import check_foreign, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import MapConfig
@@ -98,7 +98,7 @@ class SavedRun:
         self.run.verify(self._model_file)
         few = dataclasses.replace(self.config, n_envs=min(self.config.n_envs, 2), callbacks=[])
         context = dataclasses.replace(make_context(few, self.mdp), only_asked=True)
-        agent = family(self.config.agent).build(self.config.agent, context)
+        agent: Agent = self.config.agent.build(context)
         agent.load(self._model_file)
         return agent
 
@@ -129,7 +129,7 @@ def settings_of(
             callbacks = config.callbacks if trains else []
             used = {"agent": dataclasses.asdict(config.agent), "callbacks": callbacks}
             check_foreign(used, str(run.manifest_file), allow)
-        family(config.agent).check(config)
+        config.agent.check(config)
     except RecursionError:
         raise InputError(f"{run.manifest_file}: config is nested too deeply") from None
     return config

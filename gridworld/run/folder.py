@@ -129,10 +129,14 @@ def check_writable(folder: Path, key: str) -> None:
 
 @contextlib.contextmanager
 def alone_in(folder: Path, wait: float = 0) -> Iterator[None]:
-    """Hold a folder for this process; an `InputError` if another still holds it after `wait` seconds."""
+    """Hold a folder for this process, and remove what one that died has left half written.
+
+    Raises `InputError` if another process still holds it after `wait` seconds.
+    """
     with locked(folder / LOCK, wait) as is_ours:
         if not is_ours:
             raise InputError(f"{shown(folder)}: another process is using it; wait for it or stop it")
+        tidy(folder)
         yield
 
 
@@ -156,7 +160,8 @@ def claimed(folder: Path, begun: str = MANIFEST, alone: bool = True) -> Iterator
             with contextlib.suppress(OSError):
                 if not (folder / begun).exists():
                     tidy(folder)
-                    remove_path(inside(folder, HYDRA))  # which is there for a run that never started
+                    if begun == MANIFEST:  # what Hydra wrote for a run that never started
+                        remove_path(inside(folder, HYDRA))
                     (folder / LOCK).unlink(missing_ok=True)
                     folder.rmdir()
                     if is_first:

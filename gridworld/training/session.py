@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gridworld.agents import Agent, Learning, family
+from gridworld.agents import Agent, Learning
 from gridworld.config.settings import privileges
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.errors import InputError
@@ -103,7 +103,7 @@ class Session:
             self._wandb = begin(config, [self._origin["identity"], folder.absolute()], state is not None)
         self._has_scalars = config.logging.tensorboard or config.logging.wandb
         context = make_context(config, mdp, self._write_scalars if self._has_scalars else None)
-        self._agent = family(config.agent).build(config.agent, context)
+        self._agent: Agent = config.agent.build(context)
         on_built(self._agent)
         self._visits = context.envs.visits
         self._curve = LearningCurve(self._evaluator, self._agent, config, context.envs)

@@ -7,7 +7,7 @@ import functools
 from collections.abc import Callable
 from importlib.util import find_spec
 
-from gridworld.agents import TrainingContext, WriteScalars, family
+from gridworld.agents import TrainingContext, WriteScalars
 from gridworld.config.presets import LARGE, STOCHASTIC, fitting_preset, is_recipe_for
 from gridworld.config.train import AUTO, PICTURES, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
@@ -23,7 +23,7 @@ _QUICKLY_SOLVED = 6000  # outcomes of all states and actions
 def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled) -> Mdp:
     """Check everything that can be checked without the agent's library; returns the run's world."""
     check(config)
-    family(config.agent).check(config)
+    config.agent.check(config)
     mdp = world(config.env)
     config.env.step_limit(mdp)
     if config.logging.wandb and find_spec("wandb") is None:
@@ -33,20 +33,16 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
         from gridworld.visualization.files import require_video
 
         require_video()
-    if wanted.cell_size is not None and (wanted.frames or wanted.gif or wanted.mp4):
+    if wanted.cell_size is not None and (wanted.learning or wanted.frames or wanted.gif or wanted.mp4):
         from gridworld.envs.rendering import frame_size
 
         frame_size(mdp, wanted.cell_size)
     return mdp
 
 
-def make_context(
-    config: TrainConfig,
-    mdp: Mdp,
-    write_scalars: WriteScalars | None = None,
-) -> TrainingContext:
+def make_context(config: TrainConfig, mdp: Mdp, write_scalars: WriteScalars | None = None) -> TrainingContext:
     """Make `config.n_envs` fresh environments, and what else an agent is built from."""
-    share, shown = config.exploring_starts, config.observation
+    share = config.exploring_starts
     return TrainingContext(
         envs=StatisticsVectorEnv(
             config.n_envs,
@@ -55,13 +51,13 @@ def make_context(
             mdp=_with_exploring_starts(mdp, share) if share else mdp,
             stratified=config.stratified_draws,
         ),
-        observation=make_observation(mdp, shown.kind, shown.cell_size),
+        observation=make_observation(mdp, config.observation.kind, config.observation.cell_size),
         seed=config.seed,
         device=config.device,
         threads=config.threads,
         write_scalars=write_scalars,
         callbacks=config.callbacks,
-        features=shown.policy_kwargs(),
+        features=config.observation.policy_kwargs(),
     )
 
 
@@ -74,7 +70,7 @@ def import_for(config: TrainConfig) -> None:
     """Import what a run of this configuration takes, for processes that are forked from this one."""
     from gridworld.visualization.picture import drawer
 
-    family(config.agent).import_for(config.agent)
+    config.agent.import_libraries()
     for picture in PICTURES:
         if getattr(config.recording, picture.setting):
             drawer(picture.drawer)

@@ -29,7 +29,7 @@ from typing import Any
 from omegaconf import OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.agents import Learning, family
+from gridworld.agents import Learning
 from gridworld.bounds import LARGEST_INTEGER
 from gridworld.config.compose import to_config
 from gridworld.config.train import TrainConfig
@@ -235,7 +235,7 @@ def learning(
     mdp = check_settings(config)
     evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
     context = make_context(config, mdp)
-    agent = family(config.agent).build(config.agent, context)
+    agent = config.agent.build(context)
     curve = LearningCurve(evaluator, agent, config, envs=context.envs)
     steps = 0
 

@@ -46,7 +46,6 @@ from gridworld.storage.atomic_write import (
     check_no_links,
     inside,
     is_locked,
-    tidy,
     write_json,
     write_text,
 )
@@ -78,14 +77,9 @@ _OF_A_RECIPE = ON_RESULT - {Effect.SEED, Effect.MACHINE}
 def tune(spec: StudySpec) -> None:
     """Run what the study lacks, confirm the winner, and write and print what came of it."""
     check_study_folder(spec.folder)
-    is_shared = spec.settings.storage is not None
+    alone = spec.settings.storage is None  # nobody else searches for this study
     try:
-        with (
-            claimed(spec.folder, SEARCH_JSON, alone=not is_shared),
-            exiting(signal.SIGINT, signal.SIGTERM),
-        ):
-            if not is_shared:
-                tidy(spec.folder)
+        with claimed(spec.folder, SEARCH_JSON, alone), exiting(signal.SIGINT, signal.SIGTERM):
             _tune(spec)
     except SystemExit as stop:
         raise Interrupted(int(str(stop.code)) - 128) from None

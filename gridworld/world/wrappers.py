@@ -221,7 +221,7 @@ class Wrapped:
             seen[id(wrapper)] = env
         with self._refusing("cannot be reset"):
             env.reset()
-        return env  # type: ignore[no-any-return]
+        return env
 
     @contextmanager
     def _refusing(self, what: str) -> Iterator[None]:

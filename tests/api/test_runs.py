@@ -20,7 +20,6 @@ from PIL import Image
 
 import gridworld
 from gridworld import InputError
-from gridworld.agents import family
 from gridworld.training.session import Session
 
 TIMES = ("train_seconds", "evaluation_seconds")
@@ -47,7 +46,7 @@ def test_bit_for_bit_what_the_command_does(agent: str, tmp_path: Path) -> None:
 
     assert (tmp_path / "mine" / "curve.csv").read_bytes() == (theirs / "curve.csv").read_bytes()
     expected = timeless(json.loads((theirs / "summary.json").read_text()))
-    weights = family(kept.config.agent).weights
+    weights = kept.config.agent.weights
     of_command, of_call = (weights(each / "model.zip", 10**8) for each in (theirs, tmp_path / "mine"))
     assert of_command.keys() == of_call.keys()
     assert all(np.array_equal(of_command[name], of_call[name]) for name in of_command)
@@ -146,7 +145,7 @@ def test_settings_are_those_of_the_command_line() -> None:
     ("given", "sentence"),
     [
         (("agent=dnq",), "agent=dnq: no such choice; choose from"),
-        (("agent.lr=3",), "Key 'lr' not in 'DQNConfig'; did you mean learning_rate?"),
+        (("agent.lr=3",), "no such setting in DQNConfig; did you mean learning_rate?"),
         (({"agent.gama": 0.9},), "did you mean gamma?"),
         (("seed=1,2",), "seed=1,2: has several values; call gridworld.sweep with them"),
         (("-m",), "-m: is not an override; write KEY=VALUE"),

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.wrappers import FlattenObservation, TimeLimit
-from stable_baselines3 import DQN, PPO
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
 import gridworld
@@ -83,13 +83,3 @@ def test_a_model_that_saw_the_environment_itself_is_scored_exactly(seen_as):
         found = gridworld.evaluate(model, place, deterministic=False).outcome
         assert (found.goal, found.expected_length) == pytest.approx(by_hand(env, policy, 30), rel=1e-5)
     assert gridworld.evaluate(policy, env).outcome.goal == pytest.approx(found.goal, rel=1e-5)
-
-
-def test_a_model_of_taxi_is_scored_within_the_step_limit_of_taxi():
-    model = DQN("MlpPolicy", "Taxi-v4", buffer_size=10, seed=0, device="cpu")
-    score = gridworld.evaluate(model)
-    assert score.regret > 1
-    assert score.outcome.timeout == pytest.approx(1)
-    assert score.outcome.expected_length == pytest.approx(200)
-    with pytest.raises(InputError, match=r"the model acts in Discrete.6.; CliffWalking-v1 has Discrete\(4\)"):
-        gridworld.evaluate(model, gym.make("CliffWalking-v1"))

@@ -82,11 +82,3 @@ def test_rl_zoo_is_given_the_same_steps_of_the_same_world(
     assert "20,000 steps" in row.name
     settings = OmegaConf.load(given["--conf-file"])["GridWorld-v0"]
     assert settings["env_wrapper"] == f"gridworld.{gridworld.OneHotObservation.__name__}"
-
-
-def test_a_peers_python_is_tried_by_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NAVIX_PYTHON", str(tmp_path / "none"))
-    assert peers.why_not("NAVIX") == "not measured, NAVIX_PYTHON names no Python that has it"
-    monkeypatch.setenv("NAVIX_PYTHON", sys.executable)
-    with pytest.raises(InputError, match=r"^NAVIX_PYTHON=.*: ModuleNotFoundError: No module"):
-        peers.navix()

@@ -71,6 +71,8 @@ def shortened(words: list[str]) -> list[str]:
         return [program, *rest, "--cfg"]  # reads the search space; another study searches
     if program == "tune.py":
         return [program, *_replaced(rest, [*_FEW_TRIALS, *_FEW_STEPS])]
+    if program == "report.py":
+        return [program, *rest, "--formats"]  # the page alone
     if program != "train.py":
         return [program, *rest]
     if any(word.startswith("resume=") for word in rest):

@@ -313,16 +313,13 @@ class ExactEvalCallback(BaseCallback):
         self.logger.dump(step)
         if score.shortfall < self.best_regret:
             self.best_regret = score.shortfall
-            self._keep_best()
+            if self.verbose >= 1:
+                print(f"step {step:,}: new best model, exact regret {self.best_regret:.3g}")
+            if self._best_path is not None:
+                self._best_path.mkdir(parents=True, exist_ok=True)
+                with replacing(self._best_path / BEST_MODEL) as part, part.open("wb") as file:
+                    self.model.save(file)
         if self._log_path is not None:
             table = self.evaluations
             self._log_path.mkdir(parents=True, exist_ok=True)
             write_evaluations(self._log_path / EVALUATIONS, table, **table)
-
-    def _keep_best(self) -> None:
-        if self.verbose >= 1:
-            print(f"step {self.num_timesteps:,}: new best model, exact regret {self.best_regret:.3g}")
-        if self._best_path is not None:
-            self._best_path.mkdir(parents=True, exist_ok=True)
-            with replacing(self._best_path / BEST_MODEL) as part, part.open("wb") as file:
-                self.model.save(file)

@@ -91,8 +91,7 @@ def read_table(
 
 def explored(greedy: FloatArray, epsilon: float) -> FloatArray:
     """(S, A), the action probabilities of SB3's exploration around a greedy policy (S, A)."""
-    mixed: FloatArray = (1 - epsilon) * greedy + epsilon / greedy.shape[1]
-    return mixed
+    return (1 - epsilon) * greedy + epsilon / greedy.shape[1]
 
 
 def _is_actor_critic(policy: BasePolicy) -> bool:

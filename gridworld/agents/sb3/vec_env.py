@@ -66,23 +66,18 @@ class GridWorldVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        states, rewards, terminated, truncated, ended = self.envs.advance(self._actions)
-        if self._reward_scale != 1:
-            rewards = rewards * self._reward_scale
+        step = self.envs.advance(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        if ended is None:
-            return self.observation.rows(states), rewards.astype(np.float32), terminated, infos
-        truncated &= ~terminated
-        elapsed = round(time.time() - self._started, 6)
-        last = self.observation.rows(ended.states[ended.which])
-        of_each = zip(ended.which.tolist(), last, ended.returns.tolist(), ended.lengths.tolist(), strict=True)
+        last, elapsed = self.observation.rows(step.reached[step.which]), round(time.time() - self._started, 6)
+        of_each = zip(step.which.tolist(), last, step.returns.tolist(), step.lengths.tolist(), strict=True)
         for index, observation, episode_return, length in of_each:
             infos[index] = {
                 "terminal_observation": observation,
-                "TimeLimit.truncated": bool(truncated[index]),
+                "TimeLimit.truncated": bool(step.truncated[index] and not step.terminated[index]),
                 "episode": {"r": episode_return, "l": length, "t": elapsed},
             }
-        return self.observation.rows(states), rewards.astype(np.float32), ended.mask, infos
+        rewards = (step.rewards * self._reward_scale).astype(np.float32)
+        return self.observation.rows(step.states), rewards, step.terminated | step.truncated, infos
 
     def close(self) -> None:
         self.envs.close()

@@ -10,7 +10,6 @@ import inspect
 import time
 from dataclasses import replace
 
-from gridworld.agents import family
 from gridworld.agents.sb3.settings import SB3ClassConfig
 from gridworld.config.train import AgentConfig
 from gridworld.diagnosis.evidence import Evidence, Finding
@@ -74,7 +73,7 @@ def _certified_after(
         return due if goes_on else 0
 
     try:
-        learner = family(agent).build(agent, make_context(config, run.mdp))
+        learner = agent.build(make_context(config, run.mdp))
         learner.learn(config.total_timesteps, watch)
     except InputError:  # it diverged
         return None

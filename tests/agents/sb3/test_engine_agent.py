@@ -13,8 +13,7 @@ from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
 
 import gridworld
-from gridworld.agents import Agent, TrainingContext, family
-from gridworld.agents.sb3 import check
+from gridworld.agents import Agent
 from gridworld.agents.sb3.agent import ACTIVATIONS, EngineAgent, SB3Agent
 from gridworld.agents.sb3.callbacks import FallingSetting
 from gridworld.errors import InputError
@@ -23,9 +22,7 @@ from gridworld.training.setup import make_context
 
 def built(*words: str, log: Any = None) -> Agent:
     config = configure(*words)
-    mdp = config.env.compile()
-    context: TrainingContext = make_context(config, mdp, log)
-    return family(config.agent).build(config.agent, context)
+    return config.agent.build(make_context(config, config.env.compile(), log))
 
 
 SB3S = {"dqn": DQN, "ppo": PPO, "a2c": A2C, "qrdqn": QRDQN, "trpo": TRPO}
@@ -98,8 +95,9 @@ def test_a_class_with_its_arguments(agent: str, capsys: pytest.CaptureFixture[st
     unknown = "agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU"
     assert type(built(f"agent={agent}", f"+{unknown}")) is SB3Agent
     assert f"engine: stock, since the tabulated engine does not support {unknown}" in capsys.readouterr().err
+    config = configure(f"agent={agent}", "agent.engine=fast")
     with pytest.raises(InputError, match=r"agent\.engine=fast: must be tabulated or stock"):
-        check(configure(f"agent={agent}", "agent.engine=fast"))
+        config.agent.check(config)
 
 
 @pytest.mark.parametrize("kind", ACTIVATIONS)
