@@ -15,7 +15,7 @@ os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # before pygame is imported
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # a second thread waits busily for the next product
 
 import pytest
-from helpers.quickly import collapse_memory, compose_quickly
+from helpers.quickly import compose_quickly
 from hypothesis import settings
 
 from gridworld.process import console
@@ -128,7 +128,6 @@ def pytest_collection_finish() -> None:
     compose_quickly()
     gc.freeze()
     gc.set_threshold(50_000)
-    collapse_memory()
 
 
 @pytest.hookimpl(optionalhook=True)

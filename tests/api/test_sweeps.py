@@ -68,7 +68,7 @@ def test_a_sweeps_report(swept: gridworld.SweepResult, folder: Path, tmp_path: P
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["agent=dqnn,ppo"], "agent=dqnn: there is no such choice"),
+        (["agent=dqnn,ppo"], "agent=dqnn: no such choice"),
         (["agent"], "agent: is not an override; write KEY=VALUE"),
         (["hydra.sweep.dir=x"], "here the folder is given by folder="),
         ([{"agent.gamma": {1}}], "agent.gamma: must be plain values, has a set"),
@@ -133,5 +133,5 @@ def test_a_study(tmp_path: Path) -> None:
     assert study.sentence in repr(study)
     found = gridworld.compose(recipe=tmp_path / "study").agent
     assert {f"agent.{key}": getattr(found, key) for key in ("learning_rate",)}.items() <= study.values.items()
-    with pytest.raises(InputError, match="seed=0,1: a study searches from one configuration"):
+    with pytest.raises(InputError, match="seed=0,1: a study has one baseline configuration"):
         gridworld.tune("agent=q_learning", seed=range(2), folder=tmp_path / "other")
