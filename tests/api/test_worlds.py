@@ -148,7 +148,7 @@ def test_a_run_is_scored_on_its_own_world() -> None:
         ),
         (lambda: gridworld.compile_env(3), "env: int contains neither a GridWorld"),
         (lambda: gridworld.compile_env(gym.make("Taxi-v4", fickle_passenger=True)), "fickle_passenger=True"),
-        (lambda: gridworld.compile_mdp("classic"), "layout='classic': must be a Layout, as from `load`"),  # type: ignore[arg-type]
+        (lambda: gridworld.compile_mdp("classic"), "layout='classic': must be a Layout; load"),  # type: ignore[arg-type]
         (lambda: gridworld.make_vec("FrozenLake"), "mdp=FrozenLake: must be a compiled world"),
         (
             lambda: gridworld.make_vec_env("cliff", slop=1),

@@ -110,7 +110,13 @@ def test_a_sweep_is_come_back_to(swept: Path) -> None:
 
 def test_settings_are_told_by_the_words_that_asked_for_them(tmp_path: Path) -> None:
     """Many others follow from the slip, and would hide it."""
-    words = ("agent=ppo", "env.slip=0,0.1", "observation=one_hot,coordinates", "total_timesteps=300", "seed=0")
+    words = (
+        "agent=ppo",
+        "env.slip=0,0.1",
+        "observation=one_hot,coordinates",
+        "total_timesteps=300",
+        "seed=0",
+    )
     done = sweep(*words, cwd=tmp_path)
     assert [row[2] for row in results(done.stdout)] == [
         f"env.slip={slip} observation={kind}" for slip in ("0", "0.1") for kind in ("one_hot", "coordinates")
