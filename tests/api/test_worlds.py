@@ -19,7 +19,8 @@ from gridworld import GridWorldEnv, InputError, Mdp, compile_mdp, load
 
 RAW, LAKE = "GridWorld-v0", "FrozenLake-v1"
 NEED_MORE = {"arrays", "built", "enumerated", "gymnasium"}  # env.path, env.builder, env.id
-NAMES = sorted({path.stem for path in (ROOT / "conf" / "env").glob("*.yaml")} - NEED_MORE)
+LIKE_TAXI = {"cliff_walking_v1", "frozen_lake_v1", "frozen_lake_v1_dry", "frozen_lake_8x8_v1"}  # Gymnasium's
+NAMES = sorted({path.stem for path in (ROOT / "conf" / "env").glob("*.yaml")} - NEED_MORE - LIKE_TAXI)
 
 
 def same(first: Mdp, second: Mdp) -> bool:
