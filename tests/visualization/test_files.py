@@ -98,7 +98,7 @@ def test_films_that_memory_or_a_player_could_not_hold_are_refused(monkeypatch: p
     assert automatic_cell_size(CLASSIC) == 100
     assert automatic_cell_size(compile_mdp(parse("S" + "." * 98 + "G", "wide"))) == 9
     monkeypatch.setattr(files, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install .*\[video\]"):
+    with pytest.raises(InputError, match=r"pip install -e '.*\[video\]'"):
         files.require_video()
 
 
