@@ -432,6 +432,10 @@ def test_swept_settings_are_a_line_or_a_heatmap_and_the_opening_is_short(
     assert next(sweep_charts(only, "classic")).title == "Seeds certified by learning_rate"
     assert not list(sweep_charts(replace(swept, keys=(*swept.keys, "agent.gamma")), "classic"))
     assert not sweeps(task.results[:2])  # two are a comparison
+    first, second = (swept.results[rate, "3"] for rate in ("0.002", "0.01"))
+    assert task.best == [first, second]  # in the same steps; others took more, or were not certified
+    others = [result for result in task.results if result is not first]
+    assert replace(task, results=tuple(others)).best == [second]
     page = render(report, {task.task: [], "": []})
     for words in (
         "18 runs, 1 agent, 9 configurations, 1 task",
