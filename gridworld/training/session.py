@@ -13,7 +13,7 @@ import logging
 import math
 import shlex
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -104,8 +104,9 @@ class Session:
             from gridworld.training.wandb_log import WandbLog
 
             self._wandb = WandbLog(config, [self._origin["identity"], folder.absolute()], state is not None)
-        self._scalar_logs = [log for log in (self._events, self._wandb) if log is not None]
-        context = make_context(config, mdp, self._write_scalars if self._scalar_logs else None)
+        logs = [log for log in (self._events, self._wandb) if log is not None]
+        self._write_scalars = partial(_write_scalars, logs) if logs else None
+        context = make_context(config, mdp, self._write_scalars)
         self._agent: Agent = config.agent.build(context)
         on_built(self._agent)
         self._visits = context.envs.visits
@@ -129,10 +130,6 @@ class Session:
             tell(f"no checkpoints, since {unknown} does not define get_state and set_state")
             return None
         return every
-
-    def _write_scalars(self, values: Mapping[str, float], step: int) -> None:
-        for log in self._scalar_logs:
-            log.scalars(values, step)
 
     def progress(self) -> dict[str, int | None]:
         """How many steps were made, and how many of them are saved."""
@@ -169,7 +166,7 @@ class Session:
         label = f"{config.agent.name} on {self._evaluator.mdp.name}"
         self._progress = Progress(config.total_timesteps, label, config.logging.progress)
         self._curve.sinks.append(partial(write_row, self._curve_log))
-        if self._scalar_logs:
+        if self._write_scalars is not None:
             self._curve.sinks.append(CurveScalars(self._write_scalars, self._evaluator).write)
         self._curve.sinks += [partial(show_progress, self._progress), self._pictures.write]
 
@@ -274,6 +271,12 @@ class Session:
         with contextlib.suppress(*ignored), contextlib.ExitStack() as stack:
             for close in reversed(closing):  # all of them, whatever one raises
                 stack.callback(close)
+
+
+def _write_scalars(logs: Sequence[EventWriter | WandbLog], values: Mapping[str, float], step: int) -> None:
+    # No method: the agent keeps it, and with a session that keeps the agent would be a circle.
+    for log in logs:
+        log.scalars(values, step)
 
 
 def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, seconds: float) -> Summary:
