@@ -1,9 +1,18 @@
-"""GridWorld, solved exactly: environments, observations, agents and their true scores.
+"""Train agents on worlds small enough to solve exactly, and know whether they are optimal.
 
-Importing this package registers `GridWorld-v0` with Gymnasium and imports nothing else: a public name is
-loaded when it is first asked for, so that the command line answers `--help` at once and a program that only
-steps the environment never pays for torch. The names are in `__init__.pyi`.
+    run = gridworld.train("agent=dqn")      # as on the command line; has .summary, .curve, .policy, .model
+    gridworld.diagnose(run)                 # why it is not optimal, and what to try
+    gridworld.evaluate(model, "cliff")      # the exact score of a Stable-Baselines3 model or a table
+    gridworld.make_vec_env("cliff")         # an environment for Stable-Baselines3
+    gridworld.ExactEvalCallback()           # exact curves in its own training
+    gridworld.check("my_package.MyPPO")     # tests an algorithm on worlds with known answers
+    gym.make("gridworld:GridWorld-v0")      # the environment alone
+
+Importing it registers the environment and loads nothing else; torch is imported when a name needs it.
+The names are in `__init__.pyi`.
 """
+
+import sys
 
 from gridworld.envs.registration import register_envs as _register_envs
 from gridworld.workarounds import when_gymnasium_is_imported as _when_gymnasium_is_imported
@@ -14,6 +23,16 @@ with open(f"{__file__}i", encoding="utf-8") as _file:  # "from MODULE import NAM
     _MODULES = {line.split()[-1]: line.split()[1] for line in _file if line.startswith("from ")}
 
 __all__ = list(_MODULES)
+
+
+class _Package(type(sys)):
+    def __setattr__(self, name: str, value: object) -> None:
+        """Leave the functions `sweep` and `tune` where they are, which have the names of packages."""
+        if name not in _MODULES or not isinstance(value, type(sys)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
 
 
 def __dir__() -> list[str]:

@@ -35,11 +35,10 @@ from gridworld.restore.saved_run import SavedRun, read_visits
 from gridworld.run import summary as run_summary
 from gridworld.run.folder import claimed
 from gridworld.run.reader import check_free, is_started
-from gridworld.training.pictures import PictureSubject
 from gridworld.training.setup import without_pictures
 from gridworld.training.train import train as train_in
 from gridworld.visualization.files import encode_png
-from gridworld.visualization.picture import drawer
+from gridworld.visualization.picture import Subject, drawer
 from gridworld.world.evaluation import Evaluator
 
 if TYPE_CHECKING:  # of most runs nothing is drawn
@@ -130,8 +129,8 @@ class RunResult:
         """Draw its values and greedy actions, as in `policy.png`, as a picture of Pillow; cells in pixels."""
         from PIL import Image
 
-        shown = self.config, False, self.evaluator, self.policy, self.summary["timesteps"], self.visits, None
-        return Image.fromarray(cast(Frame, drawer("maps.policy")(PictureSubject(*shown))(cell_size)))
+        shown = self.config, False, self.evaluator, self.policy, self.summary["timesteps"], self.visits
+        return Image.fromarray(cast(Frame, drawer("maps.policy")(Subject(*shown))(cell_size)))
 
     def _repr_html_(self) -> str:
         """Its verdict, learning curve and policy."""
@@ -139,7 +138,7 @@ class RunResult:
         with contextlib.suppress(InputError):  # the world is too large for a map
             pictures.append(encode_png(np.asarray(self.policy_map())))
         sources = (f"data:image/png;base64,{base64.b64encode(each).decode()}" for each in pictures)
-        images = "".join(f'<img src="{each}" style="max-width:100%;max-height:290px"> ' for each in sources)
+        images = "".join(f'<img src="{each}" style="max-width:100%;max-height:340px"> ' for each in sources)
         why = "" if self.summary["certified"] else "; gridworld.diagnose(run) says why"
         sentence = escape(run_summary.verdict(self.summary))
         return f"<p>{escape(repr(self))}<br><b>{sentence}</b>{why}</p>{images}"

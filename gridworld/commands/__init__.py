@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.bounds import Bounds, digits
-from gridworld.errors import EXIT_CODE, InputError, failure
+from gridworld.errors import DISTRIBUTION, EXIT_CODE, InputError, failure
 from gridworld.process.console import CONSOLE, prepare, printing, program, tell_error
 from gridworld.process.signals import Interrupted, at_work
 
@@ -134,9 +134,9 @@ def _without_command(words: Sequence[str]) -> None:
         print(_MANUAL.format(console=CONSOLE, commands=commands))
         return
     if word == "--version":
-        from gridworld import __version__
+        from importlib.metadata import version
 
-        print(f"{CONSOLE} {__version__}")
+        print(f"{CONSOLE} {version(DISTRIBUTION)}")
         return
     close = difflib.get_close_matches(word.removesuffix(".py"), COMMANDS, n=1)
     advice = f"did you mean {CONSOLE} {close[0]}?" if close else f"it is one of {', '.join(COMMANDS)}"

@@ -38,6 +38,7 @@ from gridworld.world.mdp import FloatArray, Mdp
 _SAME = 1e-9  # returns that differ by rounding alone
 _WIDEST_BOARD = 800  # pixels; two boards share twice 640
 _BORDER = 30  # pixels around a picture of Gymnasium's
+_LEAST_PICTURE = 500  # pixels, to which a smaller one is about enlarged
 _FPS = 30
 _TICKS = 5  # frames between two steps of an agent that continues alone
 _ARROWS = {"up": "up north forward", "right": "right east", "down": "down south", "left": "left west"}
@@ -172,9 +173,9 @@ class Game:
     def legend(self) -> str:
         """What the keys do."""
         mdp = self.person.evaluator.mdp
-        numbered = [f"{key}: {mdp.action_names[self.keys[key]]}" for key in self.keys.keys() - _ARROWS.keys()]
-        moves = ["arrow keys: move"] if len(numbered) < len(self.keys) else []
-        return ", ".join([*moves, *sorted(numbered), "O: optimal policy", "R: restart", "Q: quit"])
+        digits = [f"{key}: {mdp.action_names[self.keys[key]]}" for key in self.keys.keys() - _ARROWS.keys()]
+        moves = ["arrow keys: move"] if len(digits) < len(self.keys) else []
+        return ", ".join([*moves, *sorted(digits), "O: optimal policy", "R: restart", "Q: quit"])
 
 
 def _keys(mdp: Mdp) -> dict[str, int]:
@@ -195,11 +196,10 @@ def draw(game: Game, cell_size: int) -> Frame:
     boards = []
     for player in game.players:
         board = _board(player, cell_size, game.shows_optimum)
-        board.caption(player.standing())
-        words = game.legend() if player is game.person else ""
-        if game.shows_optimum and player.real is not None:
-            words = player.advice()
-        board.footer(player.verdict() if player.over else words)
+        advice = f"; {player.advice()}" if game.shows_optimum and player.real and not player.over else ""
+        board.caption(player.standing() + advice)
+        legend = game.legend() if player is game.person else ""
+        board.footer(player.verdict() if player.over else legend)
         boards.append(board.frame())
     return np.concatenate(boards, axis=1)
 
@@ -213,6 +213,8 @@ def _board(player: Player, cell_size: int, with_optimum: bool) -> Sheet:
             draw_optimal_actions(canvas, player.evaluator.solution.optimal)
         return canvas
     frame = real.frame()
+    larger = max(1, _LEAST_PICTURE // max(frame.shape))
+    frame = frame.repeat(larger, axis=0).repeat(larger, axis=1)
     height, width = frame.shape[:2]
     sheet = Sheet(width + 2 * _BORDER, height + 2 * _BORDER, _BORDER)
     picture = drawing.import_pygame().image.frombuffer(np.ascontiguousarray(frame), (width, height), "RGB")
@@ -286,9 +288,9 @@ def _parser() -> argparse.ArgumentParser:
 def _game(options: argparse.Namespace) -> Game:
     """A game in the world of the options; with an agent, its run's settings are the defaults."""
     given = {name: getattr(options, name) for name in _WORLD if getattr(options, name) is not None}
-    saved = None if options.agent is None else SavedRun(options.agent, options.trust, options.best)
-    if saved is not None and (fixed := [*options.words, *given.keys() & {"num_rows", "num_cols"}]):
+    if options.agent is not None and (fixed := [*options.words, *given.keys() & {"num_rows", "num_cols"}]):
         raise InputError(f"{fixed[0]}: with --agent, the world has the size it was trained on")
+    saved = None if options.agent is None else SavedRun(options.agent, options.trust, options.best)
     config = saved.config if saved is not None else compose(options.words) if options.words else None
     env = MapConfig() if config is None else config.env
     if isinstance(env, MapConfig):

@@ -8,16 +8,19 @@ report.
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from gridworld.commands import parser_of, whole
+from gridworld.errors import InputError
 from gridworld.process.console import printable, telling_if_slow
 from gridworld.process.user_input import limited
-from gridworld.report.analysis import MOST_SHOWN, Reason, gather, reasons
+from gridworld.report.analysis import MOST_SHOWN, Reason, Reasons, gather
+from gridworld.report.grouping import Group
 from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.folder import check_inside
@@ -39,7 +42,7 @@ def main(arguments: Sequence[str]) -> None:
     with telling_if_slow("reading the runs"):
         report = gather(options.runs, options.seed, options.log_steps)
     with telling_if_slow("diagnosing runs that are not certified"):
-        found, left_out = reasons(report.study.groups, _reason, options.diagnose)
+        found, left_out = reasons(report.study.groups, options.diagnose)
         report = replace(report, reasons=found, notes=(*report.notes, *left_out))
     with telling_if_slow("writing the report"):
         page = write_report(report, out, options.formats)
@@ -78,6 +81,23 @@ def _parser() -> argparse.ArgumentParser:
     option("--diagnose", type=whole(0), default=_MOST_DIAGNOSED, metavar="COUNT", help=most)
     option("--seed", type=whole(0), default=0, help="seed of the bootstrap (default 0)")
     return parser
+
+
+def reasons(groups: Iterable[Group], most: int) -> tuple[Reasons, list[str]]:
+    """Why runs are not certified, of so many at most: the first seed of each group before the second of any.
+
+    Also a sentence for each run of which a file is damaged.
+    """
+    found, problems = {}, []
+    columns = ([run for run in group.runs if not run.certified] for group in groups)
+    in_turn = (run for row in itertools.zip_longest(*columns) for run in row if run is not None)
+    for run in itertools.islice(in_turn, most):
+        try:
+            if (reason := _reason(run.folder)) is not None:
+                found[run.folder] = reason
+        except InputError as error:
+            problems.append(f"{run.folder}: is not diagnosed; {error}")
+    return found, problems
 
 
 def _reason(folder: Path) -> Reason | None:

@@ -31,9 +31,9 @@ from gridworld.config.compose import VERSION_BASE, completed, register_schemas, 
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import conf_folder, own_conf_folders, refuse_unclear, sentence, unreadable_file
 from gridworld.errors import EXIT_CODE, InputError
-from gridworld.process.console import printable, tell_error
+from gridworld.process.console import tell_error
 from gridworld.process.user_input import called_from, limited
-from gridworld.run.folder import MANIFEST, SWEEP_JSON, alone_in, check_inside, claimed, shown
+from gridworld.run.folder import MANIFEST, SWEEP_JSON, alone_in, check_inside, claimed, shell_path
 from gridworld.run.reader import check_free, check_is_run, is_started
 from gridworld.storage.atomic_write import check_no_links
 
@@ -152,7 +152,7 @@ def _sum_up(sweep: Path, kind: object, error: BaseException | None, trace: objec
     from gridworld.report.writer import write_over_seeds
 
     if (folder := write_over_seeds(sweep, sweep)) is not None:
-        print(f"  over seeds: {printable(shown(folder))}, next to the jobs in TensorBoard")
+        print(f"  curves over seeds: tensorboard --logdir {shell_path(folder)}")
 
 
 def run_job(settings: DictConfig) -> float:

@@ -59,7 +59,7 @@ def with_recipe(words: Sequence[str]) -> list[str]:
 
 
 def _file(word: str) -> Path:
-    given = word.partition("=")[2]
+    given = word.partition("=")[2].strip("'\"")
     if not given:
         raise InputError(f"{word}: must be a recipe's yaml, or the folder of a study")
     path = Path(given)

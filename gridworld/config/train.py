@@ -182,7 +182,8 @@ class RecordingConfig:
     frames: bool = setting(True, {_PICTURE: Picture("frames", "episode.episode")})
     gif: bool = setting(True, {_PICTURE: Picture("episode.gif", "episode.episode")})
     mp4: bool = setting(False, {_PICTURE: Picture("episode.mp4", "episode.episode")})
-    cell_size: int | None = setting(None, bounds(2))  # pixels of the episode's; null: 100, less on large maps
+    # pixels of a cell of the episode and of learning.gif; null: what fits
+    cell_size: int | None = setting(None, bounds(2))
     fps: int = setting(4, bounds(1, 100))  # frames a second
 
 

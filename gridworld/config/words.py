@@ -45,7 +45,9 @@ _HINTS = (  # a pattern of what is said: what would have been right
         r"'\d+\.0' of type 'float' could not be converted to Integer",
         "; in YAML, write whole numbers without a decimal point or exponent",
     ),
+    (r"Value '\d+(\.\.|-)\d+'", "; a range, for -m, is range(1,6)"),
 )
+_SYNTAX = ": is not valid syntax; is a comma, a bracket or a quotation mark missing or left over?"
 _LISTED = 24  # choices of a group that are listed at most; of more, those with a similar name
 _PACKAGE = Path(__file__).parents[1]
 _WITH_VALUE = (  # Hydra's options that the next word belongs to
@@ -163,7 +165,12 @@ def sentence(error: BaseException) -> str:
     override = getattr(error, "override", None)
     if override and override not in facts[0]:
         facts.insert(0, override)
-    return ": ".join(fact.strip().rstrip(".:") for fact in facts) + _suggestion(" ".join(facts), message)
+    text = ": ".join(fact.strip().rstrip(".:") for fact in facts)
+    text = re.sub(
+        r"Could not override '([^']*)': Key '[^']*' not in '(\w+)'", r"\1: no such setting in \2", text
+    )
+    text = re.sub(r": (mismatched input|no viable alternative|extraneous input|token recog).*", _SYNTAX, text)
+    return text + _suggestion(" ".join(facts), message)
 
 
 def unreadable_file(error: Exception, folders: Iterable[Path]) -> str:
@@ -230,14 +237,18 @@ def _alike(name: str, key: str) -> str:
     if near := meant(key, sorted({each.partition(".")[0] for each in own} - {key})):
         return near
     last = {each: each.rpartition(".")[2] for each in known if each.partition(".")[0] != section}
-    alike = difflib.get_close_matches(key, set(last.values()), n=1, cutoff=0.8)
+    alike = _similar(key, sorted(set(last.values())), n=1, cutoff=0.8)
     return _or(sorted(each for each, part in last.items() if [part] == alike)) or "; --cfg job shows all keys"
 
 
 def meant(key: str, known: list[str]) -> str:
     """The names that `key` looks like, or is the initials of, as a question; "" if there is none."""
+    return _or(_similar(key, known))
+
+
+def _similar(key: str, known: list[str], n: int = 3, cutoff: float = 0.6) -> list[str]:
     initials = [name for name in known if "_" in name and "".join(w[:1] for w in name.split("_")) == key]
-    return _or(initials or difflib.get_close_matches(key.lower(), known, n=3))
+    return initials or difflib.get_close_matches(key.lower(), known, n, cutoff)
 
 
 def _or(names: list[str]) -> str:

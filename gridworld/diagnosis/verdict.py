@@ -194,6 +194,7 @@ def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:
         table.legend(scale, "regret")
         return table.frame()
     canvas = Canvas(mdp, cell_size)
+    cost = canvas.board.summed(cost)
     scale = linear(ORANGES, cost[canvas.board.floor], low=0.0)
     colours = scale.colours(cost)
     colours[cost == 0] = PAPER

@@ -105,6 +105,12 @@ class Board:
         shown[self.state[self.kind == Kind.FLOOR]] = True
         return frozen(shown)
 
+    def summed(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Numbers (S,), those of states in one cell added up: all of these have the sum."""
+        has_place, totals = self.cell[:, 0] >= 0, np.zeros(self.state.shape, numbers.dtype)
+        np.add.at(totals, tuple(self.cell[has_place].T), numbers[has_place])
+        return np.where(has_place, totals[tuple(self.cell.T)], numbers)
+
 
 _boards: WeakKeyDictionary[Mdp, Board] = WeakKeyDictionary()
 

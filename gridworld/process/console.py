@@ -194,9 +194,10 @@ class ProgressLine:
         self._shown = ""
 
     def show(self, text: Callable[[], str]) -> None:
-        """Print the line that `text` returns; it is called only if a line is due."""
+        """Print the line that `text` returns, which is called if one is due; without its label if long."""
         if self._enabled and self._in_place:
-            line = text()[: shutil.get_terminal_size(_SIZE_OF_NOTEBOOK).columns - 1]
+            line, room = text(), shutil.get_terminal_size(_SIZE_OF_NOTEBOOK).columns - 1
+            line = line if len(line) <= room else line.split(": ", 1)[-1][:room]
             print(f"\r{line:<{len(self._shown)}}", end="", file=sys.stderr, flush=True)
             self._shown = line
         elif self._enabled and time.monotonic() - self._printed >= self._seconds_between_lines:
@@ -207,6 +208,7 @@ class ProgressLine:
         """Remove the line from a terminal."""
         if self._shown:
             print(f"\r{'':{len(self._shown)}}\r", end="", file=sys.stderr, flush=True)
+            self._shown = ""
 
     def close(self) -> None:
         """Leave the line on a terminal as it is, and begin another."""
@@ -229,7 +231,7 @@ class Progress(ProgressLine):
         first, begun = self._first
         left = time_left(step - first, total - step, now - begun) if step < total else ""
         share = min(step / total, 1.0)
-        self.show(lambda: f"{self._label}: step {step:,} of {total:,} ({share:.0%}){left}, {note}")
+        self.show(lambda: f"{self._label}: step {step:,} of {total:,} ({share:.0%}), {note}{left}")
 
 
 _is_telling: ContextVar[bool] = ContextVar("is_telling", default=False)

@@ -88,8 +88,8 @@ def _curves(analysis: TaskAnalysis, styles: Styles, more: str) -> Iterator[Chart
         # The first tenth, where most is learnt, would flatten all the rest.
         late = np.concatenate([band.point[len(band.point) // 10 :] for band in bands.values()])
         yield draw(
-            f"{task} on-line return",
-            f"On-line return on {task}",
+            f"{task} online_return",
+            f"Online return on {task}",
             describe("mean return of the training episodes, exploration included", _BOOTSTRAP),
             bands,
             label="return",
@@ -105,11 +105,11 @@ def run_chart(
     metric = next((each for each in metrics.METRICS if each.name == key), None)
     if metric is None:
         known = ", ".join(each.name for each in metrics.METRICS)
-        raise InputError(f"metric={key!r:.80}: there is no such curve; it is one of {known}")
+        raise InputError(f"metric={key!r:.80}: no such curve; choose from {known}")
     steps, bands = curve["step"], dict[str, Band]()
     for name, column in (("greedy", key), ("with exploration", f"sampled_{key}")):
         unknown = np.full(len(steps), math.nan)
-        bands[name] = Band(steps, curve[column], curve[column], unknown, unknown, int(steps[-1]))
+        bands[name] = Band(steps, curve[column], unknown, unknown, int(steps[-1]))
     mdp = evaluator.mdp
     random = evaluator.score(np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions))
     optimum = metric.of(metrics.optimal_score(evaluator))
@@ -264,7 +264,7 @@ def overall_charts(overall: Overall, styles: Styles) -> Iterator[Chart]:
         "Performance profiles over all tasks",
         f"share of runs whose optimality is above each level, averaged over tasks{most}; pointwise 95 % "
         "stratified bootstrap intervals",
-        {agent: Band(levels, point, point, low, high, end) for agent, (point, low, high) in profiles.items()},
+        {agent: Band(levels, point, low, high, end) for agent, (point, low, high) in profiles.items()},
         styles,
         "runs above it",
         (0.0, 1.0),

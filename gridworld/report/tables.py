@@ -34,14 +34,14 @@ _HEADINGS = {
 
 
 @dataclass(frozen=True)
-class Estimate:
+class IntervalCell:
     """An interval with the way its numbers are written."""
 
     interval: Interval
     form: Callable[[float], str]
 
 
-Cell = str | float | int | None | Share | Estimate
+Cell = str | float | int | None | Share | IntervalCell
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def texts(cell: Cell) -> tuple[str, str]:
             return cell, ""
         case Share(count, total, low, high):
             return f"{count} / {total}", f"[{100 * low:.0f} %, {100 * high:.0f} %]"
-        case Estimate(Interval(point, low, high), form):
+        case IntervalCell(Interval(point, low, high), form):
             return form(point), "" if math.isnan(low) else f"[{form(low)}, {form(high)}]"
         case int():
             return f"{cell:,}", ""
@@ -132,7 +132,7 @@ def to_csv(table: Table) -> str:
 def _csv_parts(cell: Cell) -> dict[str, object]:
     """What a cell comes to, by the ends of its columns' headings."""
     match cell:
-        case Estimate(Interval(point, low, high), _):
+        case IntervalCell(Interval(point, low, high), _):
             return {"": _digits(point), " low": _digits(low), " high": _digits(high)}
         case Share(count, total, low, high):
             return {"": count, " of": total, " low": _digits(low), " high": _digits(high)}
@@ -214,11 +214,11 @@ def scores_table(task: TaskAnalysis) -> Table:
     return _table_of(task.results, f"{task.task} scores", caption, columns, rows)
 
 
-def estimate(result: Result, key: str, statistic: str) -> Estimate | None:
+def estimate(result: Result, key: str, statistic: str) -> IntervalCell | None:
     """A statistic of a metric as a cell; None where no run has the metric."""
     found = result.estimates.get((key, statistic))
     form = steps_up_to(result.shortest_uncertified) if key == "steps" else number
-    return None if found is None else Estimate(found, form)
+    return None if found is None else IntervalCell(found, form)
 
 
 def improvement_tables(comparisons: Comparisons, name: str) -> Iterator[Table]:
@@ -228,7 +228,9 @@ def improvement_tables(comparisons: Comparisons, name: str) -> Iterator[Table]:
         rows: list[list[Cell]] = []
         for one in agents:
             found = (comparisons.get((key, one, other)) for other in agents)
-            rows.append([one, *(None if each is None else Estimate(each, "{:.2f}".format) for each in found)])
+            rows.append(
+                [one, *(None if each is None else IntervalCell(each, "{:.2f}".format) for each in found)]
+            )
         caption = f"Probability that a run of the row's agent beats one of the column's in {title}"
         yield Table(f"{name} improvement in {title}", caption, ["agent", *agents], rows)
 
@@ -236,7 +238,7 @@ def improvement_tables(comparisons: Comparisons, name: str) -> Iterator[Table]:
 def overall_table(overall: Overall) -> Table:
     """One number an agent, over all its tasks."""
     rows: list[list[Cell]] = [
-        [agent, f"{count} of {overall.tasks}", Estimate(interval, number)]
+        [agent, f"{count} of {overall.tasks}", IntervalCell(interval, number)]
         for agent, (count, interval) in overall.optimality.items()
     ]
     return Table("all tasks", "Optimality over tasks", ["agent", "tasks", "optimality, IQM"], rows)

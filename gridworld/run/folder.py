@@ -90,7 +90,7 @@ class RunFolder:
         """The command line that resumes the run; for settings that the user has `trusted`, it says so."""
         parts = {key: (trusted or {}).get(key) for key in ("agent", "callbacks")}  # that are built again
         trust = " trust=true" if any(foreign(parts)) else ""
-        return f"{command('train')} resume={shlex.quote(shown(self.folder))}{trust}"
+        return f"{command('train')} resume={shell_path(self.folder)}{trust}"
 
 
 def shown(folder: Path) -> str:
@@ -99,6 +99,11 @@ def shown(folder: Path) -> str:
         return printable(str(folder.relative_to(users_folder())))
     except ValueError:
         return printable(str(folder))
+
+
+def shell_path(folder: Path) -> str:
+    """The same, quoted where a shell needs it."""
+    return shlex.quote(shown(folder))
 
 
 def check_inside(path: Path, key: str) -> None:
@@ -124,10 +129,14 @@ def check_writable(folder: Path, key: str) -> None:
 
 @contextlib.contextmanager
 def alone_in(folder: Path, wait: float = 0) -> Iterator[None]:
-    """Hold a folder for this process; an `InputError` if another still holds it after `wait` seconds."""
+    """Hold a folder for this process, and remove what one that died has left half written.
+
+    Raises `InputError` if another process still holds it after `wait` seconds.
+    """
     with locked(folder / LOCK, wait) as is_ours:
         if not is_ours:
             raise InputError(f"{shown(folder)}: another process is using it; wait for it or stop it")
+        tidy(folder)
         yield
 
 
@@ -151,7 +160,8 @@ def claimed(folder: Path, begun: str = MANIFEST, alone: bool = True) -> Iterator
             with contextlib.suppress(OSError):
                 if not (folder / begun).exists():
                     tidy(folder)
-                    remove_path(inside(folder, HYDRA))  # which is there for a run that never started
+                    if begun == MANIFEST:  # what Hydra wrote for a run that never started
+                        remove_path(inside(folder, HYDRA))
                     (folder / LOCK).unlink(missing_ok=True)
                     folder.rmdir()
                     if is_first:

@@ -21,10 +21,11 @@ from gridworld.config.settings import ON_RESULT, effect_of, flat, with_effects
 from gridworld.envs.rollout import wilson_interval
 from gridworld.errors import InputError
 from gridworld.process.console import aligned, command, command_line, duration, printable
+from gridworld.run.folder import shell_path
 from gridworld.run.reader import read_run
 from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
 
-_HEADINGS = ("agent", "task", "settings", "certified", "steps to certificate, median")
+_HEADINGS = ("agent", "task", "settings", "certified", "median steps")
 _OF_SETTINGS = ON_RESULT - {Effect.SEED, Effect.LABELS, Effect.MACHINE}
 _MOST_NAMED = 3  # jobs
 _LONGEST = 60  # characters of settings
@@ -84,13 +85,6 @@ def resume_command(folder: Path, *more: str) -> str:
     return printable(shlex.join([*words, *(word for word in more if word not in words)]))
 
 
-def shell_path(folder: Path) -> str:
-    """The folder as a user would type it here, quoted where a shell needs it."""
-    path = folder.absolute()
-    here = Path.cwd()
-    return printable(shlex.quote(str(path.relative_to(here) if path.is_relative_to(here) else path)))
-
-
 def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
     """The table of the results, a line each with the headings first; empty where no job is done."""
     groups: dict[tuple[str, str], dict[str, list[_Result]]] = defaultdict(lambda: defaultdict(list))
@@ -114,7 +108,7 @@ def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
     lines = aligned([[f"{cell} " for cell in row] for row in table], forms)  # two blanks between columns
     if lost:
         named = f"{', '.join(lost[:_MOST_NAMED])}{', ...' if len(lost) > _MOST_NAMED else ''}"
-        lines[0] += f"; {len(lost)} of {len(rows)} jobs are not counted: {named}"
+        lines.append(f"{len(lost)} of {len(rows)} jobs are not counted: {named}")
     return lines
 
 

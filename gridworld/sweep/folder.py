@@ -29,7 +29,6 @@ from gridworld.storage.atomic_write import (
     check_no_links,
     is_locked,
     make_folder,
-    tidy,
     write_json,
     write_text,
 )
@@ -109,7 +108,6 @@ class SweepFolder:
             raise InputError(f"{self.path}: cannot be made ({error.strerror})") from None
         with alone_in(self.path, wait=1):
             (self.path / STOP).unlink(missing_ok=True)
-            tidy(self.path)
             yield
 
     def add(self, jobs: Sequence[Job], words: Sequence[str]) -> list[JobEntry]:

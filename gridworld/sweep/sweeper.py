@@ -22,7 +22,7 @@ from gridworld.errors import InputError, reason
 from gridworld.process.console import ProgressLine, tell, tell_error, time_left
 from gridworld.process.processes import LostError
 from gridworld.process.signals import exiting, signal_name
-from gridworld.run.folder import ERROR_FILE
+from gridworld.run.folder import ERROR_FILE, shell_path
 from gridworld.storage.atomic_write import inside, write_text
 from gridworld.sweep import console
 from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, JobRow, SweepFolder
@@ -71,7 +71,7 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
         raise  # from a cluster, not from a disk
     except OSError as error:
         again = console.resume_command(folder.path)
-        where = console.shell_path(folder.path)
+        where = shell_path(folder.path)
         tell_error(f"{where}: {reason(error)}; fix that, then resume with: {again}")
         code = 1
     if code:

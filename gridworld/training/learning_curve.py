@@ -27,7 +27,7 @@ from gridworld.storage.atomic_write import AppendLog
 from gridworld.storage.safe_read import csv_text
 from gridworld.storage.serialization import State
 from gridworld.world.evaluation import Evaluator, Score
-from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score
+from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score, regret_text
 
 if TYPE_CHECKING:
     from gridworld.process.console import Progress
@@ -262,7 +262,7 @@ def read_curve(log: AppendLog) -> dict[str, NDArray[np.float64]]:
 def show_progress(progress: Progress, evaluation: Evaluation) -> None:
     """Show how good the greedy policy is, next to the progress."""
     greedy = evaluation.greedy
-    note = f"regret {greedy.regret:.3g}, goal {greedy.outcome.goal:.0%}"
+    note = f"regret {regret_text(greedy.regret)}, goal {greedy.outcome.goal:.0%}"
     progress.update(evaluation.step, note + (", certified optimal" if greedy.certified else ""))
 
 

@@ -13,11 +13,11 @@ import logging
 import math
 import shlex
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gridworld.agents import Agent, Learning
 from gridworld.config.settings import privileges
@@ -49,9 +49,6 @@ from gridworld.training.together import Training
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import EXACT, Mdp
 from gridworld.world.metrics import numbers, optimal_numbers
-
-if TYPE_CHECKING:
-    from gridworld.training.wandb_log import WandbLog
 
 CLOCK = {"train_seconds", "evaluation_seconds"}  # the summary's times
 LOGS = {"curve": CURVE, "events": EVENTS}  # that a checkpoint has marks of, and the pattern of their names
@@ -99,13 +96,13 @@ class Session:
         if config.logging.tensorboard:
             self._events = EventWriter(folder, None if state is None else state["marks"]["events"])
         self._origin = {"identity": identity(config, mdp.text()), "environment": environment(config.agent)}
-        self._wandb: WandbLog | None = None
+        self._wandb: Any = None
         if config.logging.wandb:
-            from gridworld.training.wandb_log import WandbLog
+            from gridworld.training.wandb_log import begin
 
-            self._wandb = WandbLog(config, [self._origin["identity"], folder.absolute()], state is not None)
-        logs = [log for log in (self._events, self._wandb) if log is not None]
-        self._write_scalars = partial(_write_scalars, logs) if logs else None
+            self._wandb = begin(config, [self._origin["identity"], folder.absolute()], state is not None)
+        has_scalars = config.logging.tensorboard or config.logging.wandb
+        self._write_scalars = partial(_write_scalars, self._events, self._wandb) if has_scalars else None
         context = make_context(config, mdp, self._write_scalars)
         self._agent: Agent = config.agent.build(context)
         on_built(self._agent)
@@ -266,17 +263,19 @@ class Session:
             events = self._events
             closing += [partial(events.end_session, succeeded), lambda: events.log.sync(), events.close]
         if self._wandb is not None:
-            closing.append(partial(self._wandb.end, succeeded))
+            closing.append(partial(self._wandb.finish, int(not succeeded)))
         ignored = () if succeeded else (OSError, InputError)
         with contextlib.suppress(*ignored), contextlib.ExitStack() as stack:
             for close in reversed(closing):  # all of them, whatever one raises
                 stack.callback(close)
 
 
-def _write_scalars(logs: Sequence[EventWriter | WandbLog], values: Mapping[str, float], step: int) -> None:
-    # No method: the agent keeps it, and with a session that keeps the agent would be a circle.
-    for log in logs:
-        log.scalars(values, step)
+def _write_scalars(events: EventWriter | None, wandb: Any, values: Mapping[str, float], step: int) -> None:
+    # Not a method: the agent keeps it, and the session the agent, which would be a circle.
+    if events is not None:
+        events.scalars(values, step)
+    if wandb is not None:
+        wandb.log({**values, "step": step})
 
 
 def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, seconds: float) -> Summary:

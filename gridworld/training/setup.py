@@ -33,7 +33,7 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
         from gridworld.visualization.files import require_video
 
         require_video()
-    if wanted.cell_size is not None and (wanted.frames or wanted.gif or wanted.mp4):
+    if wanted.cell_size is not None and (wanted.learning or wanted.frames or wanted.gif or wanted.mp4):
         from gridworld.envs.rendering import frame_size
 
         frame_size(mdp, wanted.cell_size)

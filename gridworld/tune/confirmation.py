@@ -40,6 +40,7 @@ from gridworld.world.mdp import FloatArray
 CONFIRM = "confirm"  # the folder of the winner's runs, in the study's
 _HASH_SHOWN = 8  # characters
 _LOST_REGRET = sys.float_info.max  # of a run that failed
+_IN_TENSORBOARD = 10  # runs of a configuration: of more than 40 runs it selects none
 
 
 @dataclass(frozen=True)
@@ -133,13 +134,15 @@ def _training(run: HeldOutRun) -> Training[None]:
 
 
 def held_out_runs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[int]) -> list[HeldOutRun]:
-    """A run of a configuration on each seed.
+    """A run of a configuration on each seed; only the first ones write event files.
 
     A run's folder has a hash of its settings in its name: other settings are other runs.
     """
-    world, runs = config.env.compile().text(), []
+    world, runs = config.env.compile().text(), list[HeldOutRun]()
+    silent = dataclasses.replace(config.logging, tensorboard=False)
     for seed in seeds:
-        of_seed = dataclasses.replace(config, seed=seed)
+        logging = config.logging if len(runs) < _IN_TENSORBOARD else silent
+        of_seed = dataclasses.replace(config, seed=seed, logging=logging)
         digest = settings_hash(dataclasses.asdict(of_seed), world)[:_HASH_SHOWN]
         runs.append(HeldOutRun(folder / CONFIRM / f"{name},{digest},seed={seed}", of_seed))
     return runs

@@ -33,9 +33,9 @@ from gridworld.errors import InputError
 from gridworld.process.console import ProgressLine, tell, time_left
 from gridworld.process.processes import LostError, Processes
 from gridworld.report.tuning_study import TRIALS_CSV
+from gridworld.run.folder import shell_path
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.safe_read import csv_text
-from gridworld.sweep.console import shell_path
 from gridworld.sweep.folder import one_line
 from gridworld.tune.objective import (
     DRAW,

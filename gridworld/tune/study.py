@@ -40,18 +40,16 @@ from gridworld.process.processes import Processes, can_fork
 from gridworld.process.signals import Interrupted, exiting
 from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.report.writer import write_over_seeds
-from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, check_writable, claimed
+from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, check_writable, claimed, shell_path
 from gridworld.run.provenance import versions
 from gridworld.storage.atomic_write import (
     check_no_links,
     inside,
     is_locked,
-    tidy,
     write_json,
     write_text,
 )
 from gridworld.storage.safe_read import LARGEST_CSV, file_sha256, read_sealed, sealed
-from gridworld.sweep.console import shell_path
 from gridworld.sweep.plan import may_fork
 from gridworld.training.setup import import_for
 from gridworld.training.tensorboard import hparams
@@ -79,14 +77,9 @@ _OF_A_RECIPE = ON_RESULT - {Effect.SEED, Effect.MACHINE}
 def tune(spec: StudySpec) -> None:
     """Run what the study lacks, confirm the winner, and write and print what came of it."""
     check_study_folder(spec.folder)
-    is_shared = spec.settings.storage is not None
+    alone = spec.settings.storage is None  # nobody else searches for this study
     try:
-        with (
-            claimed(spec.folder, SEARCH_JSON, alone=not is_shared),
-            exiting(signal.SIGINT, signal.SIGTERM),
-        ):
-            if not is_shared:
-                tidy(spec.folder)
+        with claimed(spec.folder, SEARCH_JSON, alone), exiting(signal.SIGINT, signal.SIGTERM):
             _tune(spec)
     except SystemExit as stop:
         raise Interrupted(int(str(stop.code)) - 128) from None

@@ -566,7 +566,7 @@ def test_a_predict_of_its_own_is_what_is_scored() -> None:
         plain.predict = rotating.predict
         assert gridworld.evaluate(plain) == gridworld.evaluate(rotating)
     assert differ
-    with pytest.raises(InputError, match=r"has its own predict\(\), so the distribution"):
+    with pytest.raises(InputError, match=r"has its own predict\(\), so its exploring"):
         gridworld.evaluate(rotating, deterministic=False)
     for told, kind in REFUSED_PREDICTS.items():
         with pytest.raises(InputError, match=told):

@@ -115,15 +115,13 @@ def test_a_run_shows_itself(run: gridworld.RunResult) -> None:
     assert names[:3] == ["greedy", "with exploration", "optimum"]
     drawn = {tuple(line.get_ydata()) for line in figure.axes[0].lines}
     assert tuple(run.curve["regret"]) in drawn
-    with pytest.raises(
-        InputError, match="metric='speed': there is no such curve; it is one of value, regret"
-    ):
+    with pytest.raises(InputError, match="metric='speed': no such curve; choose from value, regret"):
         run.plot("speed")
     with Image.open(Path(run.folder or "") / "policy.png") as picture:
         assert np.array_equal(np.asarray(picture), np.asarray(run.policy_map()))
     html = run._repr_html_()
     assert html.count('<img src="data:image/png;base64,') == 2
-    assert "not optimal: regret" in html
+    assert "<b>certified optimal since step 2,000</b>" in html
     run.summary["agent"] = "<b>x</b>"
     assert "<b>x</b>" not in run._repr_html_()
     run.summary["agent"] = "q_learning"
@@ -147,7 +145,7 @@ def test_settings_are_those_of_the_command_line() -> None:
     ("given", "sentence"),
     [
         (("agent=dnq",), "agent=dnq: no such choice; choose from"),
-        (("agent.lr=3",), "Key 'lr' not in 'DQNConfig'; did you mean learning_rate?"),
+        (("agent.lr=3",), "no such setting in DQNConfig; did you mean learning_rate?"),
         (({"agent.gama": 0.9},), "did you mean gamma?"),
         (("seed=1,2",), "seed=1,2: has several values; call gridworld.sweep with them"),
         (("-m",), "-m: is not an override; write KEY=VALUE"),

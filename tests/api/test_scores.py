@@ -55,29 +55,13 @@ def test_tables() -> None:
     assert gridworld.evaluate(q=table, env=WORLD) == expected(table)
 
 
-def test_what_an_environment_may_be() -> None:
-    actions = np.ones(30, dtype=int)
-    by_name = gridworld.evaluate(actions, "classic")
-    env = gym.make(RAW)
-    places = [
-        *(env, gridworld.OneHotObservation(env), gridworld.GridWorldEnv(), load("classic")),
-        *(gym.make_vec(RAW, num_envs=3), gridworld.make_vec_env("classic", n_envs=2)),
-        *(DummyVecEnv([lambda: gym.make(RAW)]), compile_mdp(load("classic"))),
-    ]
-    for place in places:
-        assert gridworld.evaluate(actions, place) == by_name
-    limits = [
-        gym.make(RAW, max_episode_steps=5),
-        gym.make_vec(RAW, num_envs=2, max_episode_steps=5),
-        gridworld.make_vec_env(max_episode_steps=5),
-        DummyVecEnv([lambda: gym.wrappers.TimeLimit(gridworld.GridWorldEnv(), 5)]),
-    ]
-    for limited in limits:
-        assert gridworld.evaluate(actions, limited).outcome.expected_length == 5
-
-
-@pytest.mark.parametrize("kind", WRAPPERS)
-@pytest.mark.parametrize("algorithm", SMALL, ids=lambda each: each.__name__)
+@pytest.mark.parametrize(
+    ("algorithm", "kind"),
+    [
+        *[(PPO, kind) for kind in WRAPPERS],
+        *[(DQN, "none"), (QRDQN, "one_hot"), (TRPO, "coordinates"), (A2C, "none")],
+    ],
+)
 def test_models_of_plain_sb3(algorithm: Any, kind: str) -> None:
     env = WRAPPERS[kind](gym.make(RAW, mdp=WORLD))
     model = trained(algorithm, env)

@@ -13,7 +13,6 @@ from stable_baselines3.common.logger import Logger
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.engine import dqn, on_policy, population
-from gridworld.engine.networks import aligned
 from gridworld.engine.population import Run
 from gridworld.engine.sb3_format import algorithm_of, make_run, put_weights
 from gridworld.envs.observations import make_observation
@@ -302,35 +301,3 @@ def test_rollouts_and_advantages_are_sb3s(algorithm: Any) -> None:
     buffer.compute_returns_and_advantage(last, ends[-1])
     for name, table in (("advantages", advantages), ("returns", returns)):
         assert np.allclose(getattr(buffer, name).T.ravel(), table[0], rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("states", [None, np.array([3, 7, 8])], ids=["all states", "some states"])
-@pytest.mark.parametrize(
-    ("kind", "arguments"),
-    [
-        *[("one_hot", RELU), ("one_hot", ELU), ("one_hot", LINEAR)],
-        *[("coordinates", TWO_SIZES), ("image", {})],
-    ],
-    ids=str,
-)
-def test_products_with_the_jacobian_agree_from_both_sides(
-    kind: str, arguments: dict[str, Any], states: Any
-) -> None:
-    """uᵀ(J v) = (uᵀJ) v, and J v is what small changes v of the weights do."""
-    run, _ = twins(TRPO, kind, batch_size=64, n_steps=4, **arguments)
-    for networks in run.population.all_networks:
-        (outputs,) = (each.copy() for each in networks.run(states))
-        change = torch.randn(networks.weights.shape, generator=torch.Generator().manual_seed(1))
-        slopes = np.random.default_rng(1).normal(size=outputs.shape).astype(np.float32)
-        (moved,) = networks.push(aligned(change))
-        networks.backward(slopes)
-        scale = float(np.abs(slopes * moved).sum())
-        assert float((networks.gradients * change).sum()) == pytest.approx(
-            (slopes * moved).sum(), abs=1e-5 * scale
-        )
-        weights, length = networks.weights.clone(), 1e-5  # little: ReLU has kinks
-        networks.weights.copy_(weights + length * change)
-        (ahead,) = (each.copy() for each in networks.run(states))
-        networks.weights.copy_(weights - length * change)
-        (behind,) = networks.run(states)
-        assert np.allclose((ahead - behind) / (2 * length), moved, atol=0.02 * np.abs(moved).max())

@@ -11,15 +11,13 @@ import shutil
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
-from helpers import forks
+from helpers.support import wait_for
 
-_STARTED_WITHIN = 180.0  # seconds
 _DAEMONS = ("munged", "slurmctld", "slurmd")
 _CONFIGURATION = """
 ClusterName=test
@@ -137,19 +135,6 @@ def _daemon(
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-
-
-def wait_for(
-    condition: Callable[[], object],
-    what: str,
-    process: subprocess.Popen[bytes] | forks.Started | None = None,
-) -> None:
-    """Until it holds. Fails after a while."""
-    end = time.monotonic() + _STARTED_WITHIN
-    while not condition():
-        assert time.monotonic() < end, f"waited for {what}"
-        assert process is None or process.poll() is None, f"{what} ended"
-        time.sleep(0.1)
 
 
 def _free_ports(count: int) -> list[int]:

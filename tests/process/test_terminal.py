@@ -17,26 +17,13 @@ from gridworld.sweep.folder import JobRow
 
 WORDS = st.text("ab-.0", min_size=1, max_size=30)
 USUAL = {
-    "recipe": None,
-    "preset": "none",
-    "privileges": [],
-    "agent": "dqn",
-    "env": "classic",
-    "seed": 0,
-    "timesteps": 30208,
-    "train_seconds": 0.8,
-    "max_episode_steps": 100,
-    "value": 0.93207,
-    "goal_probability": 1.0,
-    "length": 8.0,
-    "regret": 0.0,
-    "optimal_value": 0.93207,
-    "optimal_goal_probability": 1.0,
-    "optimal_length": 8.0,
+    "recipe": None, "preset": "none", "privileges": [], "agent": "dqn", "env": "classic", "seed": 0,
+    "timesteps": 30208, "train_seconds": 0.8, "max_episode_steps": 100,
+    "value": 0.93207, "goal_probability": 1.0, "length": 8.0, "regret": 0.0,
+    "optimal_value": 0.93207, "optimal_goal_probability": 1.0, "optimal_length": 8.0,
     "sampled": {"value": 0.8786, "goal_probability": 0.9737, "length": 8.392, "regret": 0.0535},
-    "certified": True,
-    "certified_since_step": 12032,
-}
+    "certified": True, "certified_since_step": 12032,
+}  # fmt: skip
 
 
 @given(st.lists(st.tuples(WORDS, WORDS, WORDS), max_size=5), st.integers(0, 12))

@@ -29,16 +29,7 @@ from gridworld.errors import InputError
 from gridworld.process.console import plain
 from gridworld.report import tables
 from gridworld.report.agent_charts import overall_charts, task_charts
-from gridworld.report.analysis import (
-    Overall,
-    Reason,
-    Report,
-    TaskAnalysis,
-    gather,
-    on_grid,
-    online_return,
-    reasons,
-)
+from gridworld.report.analysis import Overall, Reason, Report, TaskAnalysis, gather, on_grid, online_return
 from gridworld.report.chart import Chart, short_names, styles
 from gridworld.report.evidence import Evidence, read
 from gridworld.report.grouping import labels
@@ -130,7 +121,9 @@ def test_real_runs_are_reported(tmp_path: Path) -> None:
     assert "Why runs are not certified" in page
 
 
-def test_reasons_are_asked_of_each_cell_before_the_second_of_any(maker: Maker, tmp_path: Path) -> None:
+def test_reasons_are_asked_of_each_cell_before_the_second_of_any(
+    maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for seed in range(4):
         maker.write(tmp_path / f"a{seed}", seed, 1000 if seed == 0 else math.inf)
         maker.write(tmp_path / f"b{seed}", seed, math.inf, agent__learning_rate=0.001)
@@ -143,7 +136,8 @@ def test_reasons_are_asked_of_each_cell_before_the_second_of_any(maker: Maker, t
             raise InputError("a2/visits.npy: is another")
         return None if folder.name == "b0" else Reason(f"cause {folder.name > 'a1'}", "seed=1")
 
-    found, problems = reasons(report.study.groups, ask, 5)
+    monkeypatch.setattr(command, "_reason", ask)
+    found, problems = command.reasons(report.study.groups, 5)
     assert problems == [f"{tmp_path / 'a2'}: is not diagnosed; a2/visits.npy: is another"]
     assert (sorted(asked[:2]), sorted(asked)) == (["a1", "b0"], ["a1", "a2", "b0", "b1", "b2"])
     table = tables.results_table(report.tasks, found)
@@ -265,7 +259,7 @@ def test_the_last_observation_is_carried_forward(maker: Maker, tmp_path: Path) -
 
 # (file, what is done to it, words): entries of JSON, a replacement, the whole content; None: it is removed.
 DAMAGES: list[tuple[str, Any, str]] = [
-    ("manifest.json", {"status": "running"}, "'running', not finished: it is still running, or was killed"),
+    ("manifest.json", {"status": "running"}, "'running', not finished: it is still running or was killed"),
     ("manifest.json", {"status": "interrupted", "error": "by SIGINT"}, "'interrupted', not finished: by SIG"),
     ("manifest.json", {"status": "failed", "error": "InputError: diverged"}, "not finished: InputError: div"),
     ("manifest.json", "", "is not JSON"),
@@ -280,7 +274,7 @@ DAMAGES: list[tuple[str, Any, str]] = [
     ("curve.csv", None, "has no curve.csv"),
     ("curve.csv", "", "curve.csv: has no rows"),
     ("curve.csv", b"\xff\xfe\x00", "is not UTF-8 text"),
-    ("curve.csv", (",[^,]*$", ""), "line 22 has 16 of 17 columns, it was cut off"),
+    ("curve.csv", (",[^,]*$", ""), "line 22 has 16 of 17 columns; it was cut off"),
     ("curve.csv", ("\n5000,[^,]+", "\n5000,nan"), "value is NaN"),
     ("curve.csv", ("\n5000,", "\n5000,x"), "value: could not convert string to float"),
     ("curve.csv", ("\n5000,", "\n500,"), "the steps do not increase"),
@@ -441,7 +435,11 @@ def test_swept_settings_are_a_line_or_a_heatmap_and_the_opening_is_short(
     page = render(report, {task.task: [], "": []})
     for words in (
         "18 runs, 1 agent, 9 configurations, 1 task",
-        "4 of 9 configurations of ppo are certified optimal on all of their seeds; 3 on none",
+        "On classic, ppo by learning_rate and n_epochs: all seeds are certified with "
+        + ", ".join(f"learning_rate={rate} n_epochs={depth}" for rate in (0.002, 0.01) for depth in (3, 10)),
+        "; none with learning_rate=0.1 n_epochs=3, learning_rate=0.1 n_epochs=10, learning_rate=0.1 n_epochs",
+        "; 2 tie for best, as no interval tells them apart, among them: ppo (learning_rate=0.002, n_epochs",
+        "<h1>ppo on classic</h1>",
         "<title>9 agents on classic, gridworld</title>",
         '<th scope="col">ppo (learning_<wbr>rate=<wbr>0.1, n_<wbr>epochs=<wbr>3)</th>',
     ):
@@ -554,8 +552,8 @@ def test_the_page_needs_nothing_else(written: Path) -> None:
 def test_figures_and_tables_are_files_too(written: Path) -> None:
     figures, of_tables = (sorted((written / name).iterdir()) for name in ("figures", "tables"))
     names = {path.stem for path in figures}
-    assert {"classic_regret", "cliff_on-line_return", "all_tasks_profiles"} <= names
-    assert not [name for name in names if " " in name]
+    assert {"classic_regret", "cliff_online_return", "all_tasks_profiles"} <= names
+    assert not [path.stem for path in (*figures, *of_tables) if re.search("[ ,()]", path.stem)]
     assert {path.name for path in figures} == {f"{n}.{kind}" for n in names for kind in FORMATS}
     for path in figures:
         content = path.read_bytes()
@@ -580,9 +578,9 @@ def test_figures_and_tables_are_files_too(written: Path) -> None:
 
 def test_the_same_runs_give_the_same_bytes(written: Path, study: Report) -> None:
     runs = written.parent
-    before = {path: path.read_bytes() for path in written.rglob("*.*") if "tfevents" not in path.name}
-    assert len(before) > 50
-    report_of(runs, code=1, options=FORMATS)
+    before = {path: path.read_bytes() for path in (*written.glob("*.html"), *written.glob("tables/*"))}
+    assert len(before) > 10
+    report_of(runs, code=1)
     assert before == {path: path.read_bytes() for path in before}
     overall = gather([runs], seed=1).overall
     assert overall is not None
@@ -599,7 +597,7 @@ def test_tensorboard_has_bands(written: Path) -> None:
         points = [{event.step: event.value for event in events.Scalars(tag)} for tag in tags]
         assert points[0].keys() == points[1].keys() == points[2].keys(), name
         assert all(points[1][step] <= points[0][step] <= points[2][step] for step in points[0]), name
-    assert max(event.step for event in events.Scalars("regret/mean")) == 20000
+    assert max(event.step for event in events.Scalars("eval/regret")) == 20000
     layout = layout_pb2.Layout.FromString(
         events.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0]
     )
@@ -620,7 +618,7 @@ def test_a_studys_page_has_its_own_title_and_explains_its_medians(maker: Maker, 
     assert "half of the runs were certified for good" in page
     maker.write(tmp_path / "other", 5, 3000)
     report = gather([tmp_path])
-    assert "<h1>Which agent solves which task</h1>" in render(report, charts(report))
+    assert "<h1>ppo on classic</h1>" in render(report, charts(report))
 
 
 def test_a_readmes_table_is_replaced(maker: Maker, tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 from helpers import forks
-from helpers.clusters import ray_head, slurm, wait_for
-from helpers.support import script, start
+from helpers.clusters import ray_head, slurm
+from helpers.support import script, start, wait_for
 from test_sweep import OWN_CLASSES, QUICK, curve_begun, statuses, table
 
 pytestmark = pytest.mark.slow

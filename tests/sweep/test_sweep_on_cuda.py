@@ -72,13 +72,6 @@ def test_runs_that_were_asked_for_at_once_name_each_other_and_others_are_the_run
         assert list(content) == NAMES
 
 
-def test_on_the_processor_each_is_the_run_alone_whatever_is_asked_for(tmp_path: Path) -> None:
-    done = sweep(tmp_path, "cpu", "device=cpu", "hydra.sweeper.population=3")
-    assert done.returncode == 0, done.stderr
-    assert "such runs train one by one" in done.stderr  # since they lean on each other here
-    assert all("numbers_depend_on" not in manifest_of(tmp_path / "cpu" / name) for name in NAMES)
-
-
 @pytest.fixture
 def device(monkeypatch: pytest.MonkeyPatch) -> None:
     stand_in(monkeypatch.setattr)
@@ -172,30 +165,16 @@ def test_a_run_that_went_on_says_with_whom_and_cannot_be_repeated(tmp_path: Path
             population(read_run(folder))
 
 
-# What cannot be tried out without the device
-
-
-def agents(count: int, *words: str) -> list[Any]:
-    config = configure(*(words or ["agent=ppo"]))
-    mdp = check_settings(config)
-    contexts = [make_context(config, mdp) for _ in range(count)]
-    return [config.agent.build(context) for context in contexts]
-
-
-def test_on_cuda_networks_are_of_one_kind_only_where_that_is_asked_for() -> None:
-    runs = [agent.run for agent in agents(2)]
-    for run in runs:
-        run.begin(100)
-        run.model.device = torch.device("cuda")
-    assert len({run.population.kind(run) for run in runs}) == 2
-    with mixing({"a": "", "b": ""}):
-        assert len({run.population.kind(run) for run in runs}) == 1
-
-
 @pytest.mark.parametrize("words", [["agent=ppo"], ["agent=dqn", "observation=coordinates"], ["agent=qrdqn"]])
 def test_all_tensors_are_made_where_the_weights_are(words: list[str]) -> None:
     """A tensor that is made on torch's default device instead has no numbers here, and mixes with none."""
-    runs = [agent.run for agent in agents(2, *words)]
+    config = configure(*words)
+    mdp = check_settings(config)
+    runs = []
+    for _ in range(2):
+        context = make_context(config, mdp)
+        agent: Any = config.agent.build(context)
+        runs.append(agent.run)
     population = type(runs[0].population)(runs, [run.population.get_state(run) for run in runs])
     networks, active = population.networks, np.ones(2, dtype=np.bool_)
     before = networks.weights.clone()

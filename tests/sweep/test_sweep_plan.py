@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -11,7 +11,6 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,12 +18,12 @@ from omegaconf import DictConfig
 
 from gridworld.config.compose import register_schemas, to_config
 from gridworld.config.train import TrainConfig
-from gridworld.config.words import sentence
 from gridworld.errors import InputError
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
 from gridworld.storage.safe_read import read_object
+from gridworld.sweep import plan as sweep_plan
 from gridworld.sweep.folder import folder_name
 from gridworld.sweep.plan import Configurations, Job, expand, largest_population, plan, populations
 from gridworld.training.setup import check_settings
@@ -63,24 +62,6 @@ def test_every_combination_is_a_job(loader: ConfigLoader) -> None:
     ]
     assert lines(loader, "env.layout='a,b.txt'", "seed=1", "seed=2") == ["env.layout='a,b.txt' seed=2"]
     assert lines(loader) == [""]
-
-
-@pytest.mark.parametrize(
-    ("word", "sentence"),
-    [
-        ("seed=range(0)", "seed=range(0): is empty"),
-        ("seed=range(5,5)", "is empty"),
-        ("env=glob(mars*)", "is empty"),
-        (
-            "seed=range(1000000000)",
-            "more than 1,000 jobs; if you mean that, raise",
-        ),
-        ("seed=interval(0,1)", "a sweep takes a list"),
-    ],
-)
-def test_what_makes_no_sweep_is_refused(loader: ConfigLoader, word: str, sentence: str) -> None:
-    with pytest.raises(InputError, match=re.escape(sentence)):
-        expand([word], loader, 1000)
 
 
 def test_jobs_are_the_same_if_the_same_settings_come_out(tmp_path: Path) -> None:
@@ -156,7 +137,7 @@ def test_jobs_are_divided_into_populations(
     sizes: list[int],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("gridworld.sweep.plan.file_limit", lambda: files)
+    monkeypatch.setattr(sweep_plan, "file_limit", lambda: files)
     config = configure("agent=ppo", f"device={device}")
     jobs = [Job((), (), str(number), None, config) for number in range(10)]
     groups = populations(jobs, largest_population(population), launcher, {"n_jobs": 4})
@@ -215,12 +196,6 @@ def test_each_job_is_what_hydra_composes(
     assert configs == [to_config(compose("train", job)) for job in jobs]
 
 
-def test_a_mistake_is_told_as_hydra_tells_it(loader: ConfigLoader) -> None:
-    with pytest.raises(HydraException) as mistake:
-        Configurations(loader, master_of(loader))(["agent=dqn", "agent.gama=0.5"])
-    assert "did you mean gamma" in sentence(mistake.value)
-
-
 GRID = """\
 # @package _global_
 defaults: [{override /agent: q_learning}]
@@ -272,11 +247,10 @@ def test_a_yaml_says_what_is_swept_and_that_it_is_a_sweep(conf: Path, tmp_path: 
         ),
     ],
 )
-def test_a_yaml_that_cannot_be_swept_is_refused(words: str, told: str, conf: Path, tmp_path: Path) -> None:
-    done = script("train.py", "--config-dir", str(conf), "-m", *words.split(), cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("error: ")
-    assert told in done.stderr
+def test_a_yaml_that_cannot_be_swept_is_refused(
+    words: str, told: str, conf: Path, tmp_path: Path, refusal: Callable[[str], str]
+) -> None:
+    assert told in refusal(f"train.py --config-dir {conf} -m {words}")
     assert list(tmp_path.rglob("*.*")) == []
 
 
@@ -306,12 +280,7 @@ def test_lists_that_vary_together(loader: ConfigLoader) -> None:
             "[agent,seed]: lists that vary together must have equal lengths; agent has 2, seed has 3",
         ),
         (["agent", "n_envs"], "[agent,n_envs]: n_envs has no list of values; add n_envs=A,B"),
-        (["agent", "sed"], "[agent,sed]: sed has no list of values"),
-        (["agent"], "[agent]: must name two settings or more"),
-        (
-            ["agent", "agent"],
-            "[agent,agent]: must name two settings or more",
-        ),
+        (["agent", "agent"], "[agent,agent]: must name two settings or more"),
         ([["agent", "env"], ["env", "agent"]], "[env,agent]: must name two settings or more"),
         ([1, 2], "[1,2]: 1 has no list of values"),
     ],

@@ -2,25 +2,28 @@
 
 import contextlib
 import csv
-import dataclasses
 import json
 import os
 import shutil
 import signal
 import sqlite3
 import sys
-import time
+from functools import partial
 from pathlib import Path
 
 import optuna
 import pytest
-from helpers.support import CONF, ROOT, script, start
+import yaml
+from helpers import forks
+from helpers.support import ROOT, script, start, wait_for
 from optuna.trial import TrialState, create_trial
 
 from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
 from gridworld.errors import InputError
 from gridworld.run.folder import claimed
+from gridworld.tune import study as tune_study
+from gridworld.tune import study_spec
 
 QUICK = (
     *("agent=q_learning", "total_timesteps=1500", "recording.gif=false", "recording.learning=false"),
@@ -69,10 +72,9 @@ def test_a_search_leaves_a_row_per_trial_and_a_verdict(studied: Path) -> None:
     "words", [["recipe=study"], ["--config-dir", "study/experiment/..", "experiment=winner"]]
 )
 def test_its_winner_is_a_recipe_of_train_py(words: list[str], studied: Path) -> None:
-    out = f"hydra.run.dir=won by {len(words)}"
-    done = script("train.py", *words, out, "recording.gif=false", cwd=studied)
+    done = script("train.py", *words, "--cfg", "job", cwd=studied)
     assert done.returncode == 0, done.stderr
-    config = json.loads((studied / f"won by {len(words)}" / "manifest.json").read_text())["config"]
+    config = yaml.safe_load(done.stdout)
     winner = json.loads((studied / "study" / "study.json").read_text())["winner"]
     for key, value in winner["values"].items():
         assert config["agent"][key.removeprefix("agent.")] == value, key
@@ -165,7 +167,7 @@ def test_a_search_that_comes_to_nothing_is_no_mistake_of_the_command_line(
     def all_fail(spec: object, study: optuna.Study, *more: object) -> None:
         study.add_trial(create_trial(state=TrialState.FAIL, user_attrs={"error": "training diverged"}))
 
-    monkeypatch.setattr("gridworld.tune.study.search", all_fail)
+    monkeypatch.setattr(tune_study, "search", all_fail)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(ROOT / "scripts" / "tune.py"), *QUICK])
     with pytest.raises(SystemExit) as ended:
@@ -189,7 +191,7 @@ def test_a_search_space_that_makes_no_sense(
     (tmp_path / "tune").mkdir()
     head = "" if yaml.startswith("# @") else "# @package tune.space\n"
     (tmp_path / "tune" / "bad.yaml").write_text(head + yaml.replace("|", "\n"))
-    monkeypatch.setattr("gridworld.tune.study_spec._CORNERS", 5)  # it goes with none of them
+    monkeypatch.setattr(study_spec, "_CORNERS", 5)  # it goes with none of them
     told = refusal(monkeypatch, tmp_path, "agent=q_learning", "tune=bad", "--config-dir", ".")
     assert sentence in told
     assert "\n" not in told
@@ -229,32 +231,36 @@ def workers_of(process: int, hundredths: int = 5) -> list[int]:
     return found
 
 
-def wait_for_workers(process: int, count: int, but: int = 0) -> list[int]:
-    end = time.monotonic() + 180
-    while time.monotonic() < end:
-        if len(found := [worker for worker in workers_of(process) if worker != but]) >= count:
-            return found
-        time.sleep(0.02)
-    raise AssertionError("no worker is at work")
+def wait_for_workers(process: forks.Started, count: int, but: int = 0) -> list[int]:
+    found: list[int] = []
+
+    def are_at_work() -> bool:
+        found[:] = [worker for worker in workers_of(process.pid) if worker != but]
+        return len(found) >= count
+
+    wait_for(are_at_work, "workers", process)
+    return found
 
 
 def check_ended(processes: list[int]) -> None:
     """They are gone, or will be in a moment."""
-    end = time.monotonic() + 180
-    for process in processes:
-        with contextlib.suppress(OSError):
-            while Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z":
-                assert time.monotonic() < end
-                time.sleep(0.02)
+
+    def is_gone(process: int) -> bool:
+        try:
+            return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        except OSError:
+            return True
+
+    wait_for(lambda: all(map(is_gone, processes)), "the workers' end")
 
 
 def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path: Path) -> None:
     with start("tune.py", *QUICK, *LONG, cwd=tmp_path) as process:
-        killed = wait_for_workers(process.pid, 2)[0]
+        killed = wait_for_workers(process, 2)[0]
         os.kill(killed, signal.SIGKILL)
-        told = next(line for line in process.stderr if "lost" in line)
+        told = next(line for line in process.stderr if "died" in line)
         assert told.strip() == "a worker died (exit code -9), attempt 1 of 4 at its task"
-        others = wait_for_workers(process.pid, 2, but=killed)
+        others = wait_for_workers(process, 2, but=killed)
         process.send_signal(signal.SIGINT)
         told = process.stderr.read()  # until the last worker has let go of it
     assert process.returncode == 130
@@ -279,34 +285,32 @@ def test_a_search_of_one_worker_is_the_same_however_it_is_killed(tmp_path: Path)
         study = json.loads((folder / "study" / "study.json").read_text())
         return found, (study["winner"]["values"], study["confirmation"])
 
+    def has_ended(folder: Path, trials: int) -> bool:
+        file = folder / "study" / "study.db"
+        with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(file)) as study:
+            return len(study.execute("SELECT * FROM trials").fetchall()) >= trials
+        return False
+
     for name, kills in (("calm", 0), ("killed", 2)):
-        (tmp_path / name).mkdir()
+        folder = tmp_path / name
+        folder.mkdir()
         for ended in range(kills):
-            with start("tune.py", *words, cwd=tmp_path / name) as process:
-                wait_for_trials(tmp_path / name / "study" / "study.db", ended)
-                worker = wait_for_workers(process.pid, 1)[0]
+            with start("tune.py", *words, cwd=folder) as process:
+                wait_for(partial(has_ended, folder, ended), "a trial", process)
+                worker = wait_for_workers(process, 1)[0]
                 os.kill(worker, signal.SIGKILL)
-                workers = wait_for_workers(process.pid, 1, but=worker)
+                workers = wait_for_workers(process, 1, but=worker)
                 process.kill()
                 process.stderr.read()  # until the last worker has let go of it
                 check_ended(workers)
-        done = script("tune.py", *words, cwd=tmp_path / name)
+        done = script("tune.py", *words, cwd=folder)
         assert done.returncode == 0, done.stderr
     assert outcome(tmp_path / "killed") == outcome(tmp_path / "calm")
 
 
-def wait_for_trials(database: Path, count: int) -> None:
-    end = time.monotonic() + 180
-    while time.monotonic() < end:
-        with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(database)) as study:
-            if len(study.execute("SELECT * FROM trials").fetchall()) >= count:
-                return
-    raise AssertionError("no such trial ended")
-
-
 def test_a_database_that_disappears_is_one_sentence_and_no_worker_is_left(tmp_path: Path) -> None:
     with start("tune.py", *QUICK, *LONG, cwd=tmp_path) as process:
-        workers = wait_for_workers(process.pid, 2)
+        workers = wait_for_workers(process, 2)
         (tmp_path / "study" / "study.db").unlink()
         told = process.stderr.read().splitlines()
     assert process.returncode == 1
@@ -317,27 +321,12 @@ def test_a_database_that_disappears_is_one_sentence_and_no_worker_is_left(tmp_pa
     check_ended(workers)
 
 
-@pytest.mark.parametrize("threads", [1, 2])  # workers are forks, or new processes
-def test_ctrl_c_while_workers_start_is_one_sentence(threads: int, tmp_path: Path) -> None:
-    for children in (1, 2):
-        with start("tune.py", *QUICK, *LONG, f"threads={threads}", cwd=tmp_path) as process:
-            end = time.monotonic() + 180
-            while len(workers_of(process.pid, 0)) < children and time.monotonic() < end:
-                time.sleep(0.001)
-            os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-            told = process.stderr.read()
-        assert process.returncode == 130
-        assert "Traceback" not in told
-        assert "stopped by SIGINT; finished trials are kept; resume with: python" in told
-
-
-def test_every_key_of_the_settings_stands_in_its_yaml() -> None:
-    from omegaconf import OmegaConf
-
-    from gridworld.config.sweep import TuneConfig
-
-    given = OmegaConf.load(CONF / "tune.yaml")["tune"]
-    assert set(given) == {field.name for field in dataclasses.fields(TuneConfig)} - {"space"}
-    for field in dataclasses.fields(TuneConfig):
-        if field.name != "space":
-            assert given[field.name] == field.default, field.name
+@pytest.mark.parametrize(("threads", "children"), [(1, 1), (2, 2)])  # workers are forks, or new processes
+def test_ctrl_c_while_workers_start_is_one_sentence(threads: int, children: int, tmp_path: Path) -> None:
+    with start("tune.py", *QUICK, *LONG, f"threads={threads}", cwd=tmp_path) as process:
+        wait_for(lambda: len(workers_of(process.pid, 0)) >= children, "workers", process)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        told = process.stderr.read()
+    assert process.returncode == 130
+    assert "Traceback" not in told
+    assert "stopped by SIGINT; finished trials are kept; resume with: python" in told

@@ -101,6 +101,7 @@ class _State:
     depth: int  # steps from the start
     copy: bytes  # b"" where it is no longer needed
     name: str
+    place: tuple[str, int, int] | None  # which way the agent faces, row and column
     observation: NDArray[Any] | None
     is_open: bool = False  # an episode goes on in it
     steps: Sequence[_Step] = ()  # of each action; empty where none was tried
@@ -235,7 +236,7 @@ class _Search:
 
     def _added(self, key: bytes, seen: bytes, depth: int, copy: bytes, observation: Any) -> _State:
         array, size = self._as_array(observation), 1 + len(self.states)
-        state = _State(size - 1, key, seen, depth, copy, self._state_name(), array)
+        state = _State(size - 1, key, seen, depth, copy, *self._named(), array)
         self._by_key[key] = state
         self.states.append(state)
         self._num_bytes += len(copy) + (0 if array is None else array.nbytes)
@@ -251,17 +252,18 @@ class _Search:
         check_memory(f"env.id={self.name}", self._num_bytes)
         return state
 
-    def _state_name(self) -> str:
-        """What a reader calls its state, by the attributes that minigrid's environments have; else ""."""
+    def _named(self) -> tuple[str, tuple[str, int, int] | None]:
+        """What a reader calls its state, and its place, by attributes that minigrid's environments have."""
         place, direction = (getattr(self._env, name, None) for name in ("agent_pos", "agent_dir"))
         try:
-            (col, row), facing = place, _FACING[direction]  # type: ignore[misc, index]
-            name = f"row {int(row) + 1}, column {int(col) + 1}, facing {facing}"
+            column, row = (int(each) for each in place)  # type: ignore[union-attr]
+            facing = f"facing {_FACING[direction]}"  # type: ignore[index]
         except (TypeError, ValueError, IndexError):
-            return ""
-        carried = getattr(getattr(self._env, "carrying", None), "type", None)
+            return "", None
+        if carried := getattr(getattr(self._env, "carrying", None), "type", None):
+            facing += f", carrying a {carried}"
         time = "" if "step_count" in self.ignore else f", step {getattr(self._env, 'step_count', '?')}"
-        return f"{name}{f', carrying a {carried}' if carried else ''}{time}"
+        return f"row {row + 1}, column {column + 1}, {facing}{time}", (facing, row, column)
 
     def _as_array(self, observation: Any) -> NDArray[Any] | None:
         """An observation as an array, of a Dict the `image`; None where there is none."""
@@ -307,6 +309,11 @@ class _Search:
         limits = [each for each in (self._own_limit(terminated, truncated), limit) if each is not None]
         paid = terminated & (reward > 0)
         observations = [each.observation for each in self.states if each.observation is not None]
+        found = [each.place for each in self.states if each.place is not None]
+        panels, places = list(dict.fromkeys(facing for facing, _, _ in found)), None
+        if len(found) == len(self.states):
+            places = np.array([(panels.index(facing), row, column) for facing, row, column in found])
+            places[:, 1:] -= places[:, 1:].min(axis=0)  # without the walls around the room
         check_memory(f"env.id={self.name}: its own observations", sum(each.nbytes for each in observations))
         mdp = mdp_from_outcomes(
             self.name,
@@ -319,6 +326,8 @@ class _Search:
                 success=paid[:, :, None] if paid.any() else None,
             ),
             action_names=self._action_names(),
+            places=places,
+            panel_names=panels,
             max_episode_steps=min(limits, default=None),
             own_observation=np.stack(observations) if observations else None,
         )

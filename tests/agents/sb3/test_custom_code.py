@@ -24,12 +24,11 @@ from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.reader import check_free, read_run
 
 MODULE = """
-import gridworld
 import numpy as np
 import torch
 from stable_baselines3 import A2C, DQN
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
 CALLS = []
@@ -69,10 +68,6 @@ class Recording(BaseCallback):
         return self.num_timesteps < 300
     def _on_training_end(self):
         CALLS.append("end")
-
-class Sampling(EvalCallback):
-    def __init__(self, **settings):
-        super().__init__(gridworld.make_vec_env("classic", n_envs=1), verbose=0, **settings)
 
 class Failing(Recording):
     def __init__(self):
@@ -114,7 +109,6 @@ class SavedShifting(Shifting):
     def set_state(self, state):
         self.shift = state["shift"]
 
-class Adam(torch.optim.Adam): pass
 class Remembering(ReplayBuffer): pass
 """
 LESS = ["recording.frames=false", "recording.gif=false"]
@@ -130,12 +124,7 @@ EVERY = "{_target_: stable_baselines3.common.callbacks.EveryNTimesteps, n_steps:
 SILENT = {
     "SilentA2C": ["own_code.SilentA2C"],
     "Shifting": ["stable_baselines3.A2C", f"{LAYER}own_code.Shifting"],
-    "Adam": ["stable_baselines3.A2C", "+agent.arguments.policy_kwargs.optimizer_class=own_code.Adam"],
     "Remembering": ["stable_baselines3.DQN", "+agent.arguments.replay_buffer_class=own_code.Remembering"],
-    "Sampling": [
-        "stable_baselines3.A2C",
-        "callbacks=[{_target_: own_code.Sampling, eval_freq: 50, n_eval_episodes: 2}]",
-    ],
     "Recording": ["stable_baselines3.A2C", f"callbacks=[{EVERY}{{_target_: own_code.Recording}}}}]"],
 }
 

@@ -188,7 +188,7 @@ ROW = [(1.0, 0, 0.0, False)]
 @pytest.mark.parametrize(
     ("changed", "told"),
     [
-        ({"P": None}, "has no transition table P, .*env=enumerated can find"),
+        ({"P": None}, "has no transition table P; .*env=enumerated can find"),
         ({"P": {0: {0: ROW, 1: ROW}}}, "P must have for each of 2 states and 2 actions a list"),
         ({"P": [[ROW, ROW], [ROW]]}, "P must have"),
         ({"P": [[ROW, ROW], [ROW, []]]}, "P must have"),
