@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 from collections.abc import Callable, Generator, Sequence
 from contextvars import copy_context
-from functools import partial
 from typing import Generic, ParamSpec, TypeVar
 
 from gridworld.agents import Learning, learn_together
@@ -90,11 +89,11 @@ class _Run(Generic[T]):
             self.exit = stop
         else:
             save = learning.on_safe_point
-            call = self._context.run  # in this run's context
+            context, step = self._context, learning.on_step  # a hook that knew `self` would be a circle
             self.learning = dataclasses.replace(
                 learning,
-                on_step=partial(call, learning.on_step),
-                on_safe_point=None if save is None else partial(call, save),
+                on_step=lambda steps: context.run(step, steps),
+                on_safe_point=None if save is None else lambda steps: context.run(save, steps),
             )
 
     def end(self, stop: BaseException) -> None:
