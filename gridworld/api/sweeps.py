@@ -29,7 +29,6 @@ from gridworld.process.console import ProgressLine, printable
 from gridworld.process.user_input import limited
 from gridworld.report.tuning_study import TuningStudy, find_tunings
 from gridworld.report.writer import PAGE
-from gridworld.run.folder import MANIFEST
 from gridworld.run.reader import read_run
 from gridworld.sweep import folder as sweep_folder
 from gridworld.sweep.console import counts_text, results_lines
@@ -47,11 +46,7 @@ _ERROR = re.compile(r"(?:gridworld \w+: )?error: (.*)")
 
 
 class SweepResult:
-    """A sweep: what `sweep` returns, and `open_sweep` reads from a folder. A notebook shows its results.
-
-    Attributes:
-        folder: the sweep's folder.
-    """
+    """A sweep, by its `folder`: what `sweep` and `open_sweep` return. A notebook shows its results."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -61,7 +56,7 @@ class SweepResult:
     def rows(self) -> list[dict[str, Any]]:
         """For each job its settings, `status`, and the numbers of its summary if it is done."""
         rows = []
-        for entry, row in zip(self._sweep.entries.values(), self._sweep.rows().values(), strict=True):
+        for entry, row in zip(self._sweep.entries.values(), self._jobs(), strict=True):
             words = (word.partition("=") for word in entry.overrides)
             content: dict[str, Any] = {key.lstrip("+"): _value(text) for key, _, text in words}
             content |= {"status": row.status, "error": row.error, "folder": str(self.folder / row.job)}
@@ -84,51 +79,37 @@ class SweepResult:
     @property
     def runs(self) -> list[RunResult]:
         """Those that are done, in the order in which they were asked for."""
-        rows = self._sweep.rows().values()
-        return [open_run(self.folder / row.job) for row in rows if row.status == sweep_folder.DONE]
+        return [open_run(self.folder / row.job) for row in self._jobs() if row.status == sweep_folder.DONE]
 
-    def report(self, out: str | PathLike[str] | None = None) -> Path:
-        """Write the report, as the command `report` does, and return its page.
+    def report(self) -> Path:
+        """Write the report to the folder, as the command `report` does, and return its page."""
+        _run_command("report", [str(self.folder)], progress=False)
+        return self.folder / "report" / PAGE
 
-        Args:
-            out: its folder; None: `report` in the sweep's own.
-
-        Raises:
-            InputError: no run is done, or the folder cannot be used.
-        """
-        place = Path(out or self.folder / "report").expanduser()
-        _run_command("report", [str(self.folder), "--out", str(place.absolute())], progress=False)
-        return place / PAGE
+    def _jobs(self) -> list[sweep_folder.JobRow]:
+        return list(self._sweep.rows().values())
 
     def __repr__(self) -> str:
-        return f"SweepResult({str(self.folder)!r}, {counts_text(self._sweep.rows().values())})"
+        return f"SweepResult({str(self.folder)!r}, {counts_text(self._jobs())})"
 
     def _repr_html_(self) -> str:
-        lines = results_lines(self.folder, list(self._sweep.rows().values()))
-        table = escape("\n".join(map(printable, lines)))
-        return f"<p>{escape(repr(self))}</p><pre>{table}</pre>"
+        table = "\n".join(map(printable, results_lines(self.folder, self._jobs())))
+        return f"<p>{escape(repr(self))}</p><pre>{escape(table)}</pre>"
 
 
 def sweep(
-    *overrides: Override,
-    folder: str | PathLike[str] | None = None,
-    progress: bool = True,
-    **settings: Any,
+    *overrides: Override, folder: str | PathLike[str] | None = None, progress: bool = True, **settings: Any
 ) -> SweepResult:
     """Train one run for each combination of settings, as `train -m` does: the same jobs, the same numbers.
 
-    Ctrl-C stops it as it stops the command: what has ended is kept, and the same call with the same folder
-    does the rest.
+    Ctrl-C stops it as it stops the command; the same call with the same folder does the rest.
 
     Args:
-        overrides: words as on the command line, `"agent=dqn,ppo"`, `"seed=range(3)"`, those of Hydra too,
-            `"hydra.launcher.n_jobs=2"`; or dictionaries, `{"agent.gamma": [0.9, 0.99]}`.
+        overrides: words as on the command line, `"agent=dqn,ppo"`, `"hydra.launcher.n_jobs=2"`, or
+            dictionaries, `{"agent.gamma": [0.9, 0.99]}`.
         folder: the sweep's; new, or that of a sweep to complete. None: a new one in `runs/`.
         progress: whether to show progress.
         settings: settings whose name has no dot; a list or a range is several values: `seed=range(3)`.
-
-    Returns:
-        The sweep; a job that failed has the status "failed" in its rows.
 
     Raises:
         InputError: a mistake in the settings or the folder, found before training.
@@ -142,7 +123,7 @@ def sweep(
     path = Path(folder or new).expanduser()
     words = [*command_words(overrides, settings, of_many=True), _word("hydra.sweep.dir", path)]
     _run_command("train", ["-m", *words], progress)
-    return open_sweep(path)
+    return SweepResult(path)
 
 
 @limited()
@@ -152,10 +133,7 @@ def open_sweep(folder: str | PathLike[str]) -> SweepResult:
     Raises:
         InputError: the folder holds no sweep, or its list of jobs was changed.
     """
-    path = Path(folder).expanduser()
-    if (path / MANIFEST).exists():
-        raise InputError(f"{path}: is the folder of a single run; open_run opens it")
-    return SweepResult(path)
+    return SweepResult(Path(folder).expanduser())
 
 
 def tune(
@@ -166,10 +144,7 @@ def tune(
     The same call resumes a study that was stopped. `train(recipe=folder)` trains with what was found.
 
     Args:
-        overrides: words as on the command line, `"agent=ppo"`, `"tune.trials=25"`; or dictionaries.
-        folder: the study's.
-        progress: whether to show progress.
-        settings: settings whose name has no dot, `seed=3`.
+        overrides: as for `sweep`, `"tune.trials=25"` among them; and so `folder`, `progress` and `settings`.
 
     Returns:
         The study, with the winner's `values`, and the verdict as a `sentence`.
@@ -179,23 +154,19 @@ def tune(
         KeyboardInterrupt: Ctrl-C.
     """
     path = Path(folder).expanduser()
-    words = command_words(overrides, settings, of_many=True)
-    _run_command("tune", [*words, _word("tune.folder", path)], progress)
+    words = [*command_words(overrides, settings, of_many=True), _word("tune.folder", path)]
+    _run_command("tune", words, progress)
     return find_tunings([path])[0][0]
 
 
 def record(
-    run: RunResult | str | PathLike[str],
-    format: str | Sequence[str] = ("png", "gif"),
-    out: str | PathLike[str] | None = None,
-    **options: Any,
+    run: RunResult | str | PathLike[str], *format: str, out: str | PathLike[str] | None = None, **options: Any
 ) -> Path:
     """Draw episodes and maps of a run as files, as the command `record` does, and return their folder.
 
     Args:
         run: one with a folder, or the folder.
-        format: one or several of "png", "gif", "apng", "mp4" for the episodes, "policy", "q_error", "visits"
-            for maps.
+        format: any of "png", "gif", "apng", "mp4" for the episodes, "policy", "q_error", "visits" for maps.
         out: the folder to write to; None: `recording` in the run's.
         options: the command's other options: `episodes=3`, `policy="sampled"`, `best=True`, `cell_size=40`.
 
@@ -206,11 +177,11 @@ def record(
     if folder is None:
         raise InputError("run: has no folder, so that its files are gone; train it with folder=...")
     place = Path(out or folder / "recording").expanduser()
-    formats = [format] if isinstance(format, str) else format
-    words = [str(folder), "--out", str(place.absolute()), "--format", *formats]
+    words = [str(folder), "--out", str(place.absolute()), "--format", *(format or ("png", "gif"))]
     for name, value in options.items():
-        if value is not False:
-            words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
+        words += [f"--{name.replace('_', '-')}", str(value)][
+            : 1 if value is True else 2 * (value is not False)
+        ]
     _run_command("record", words, progress=False)
     return place
 

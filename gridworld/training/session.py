@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gridworld.agents import Agent, Learning
 from gridworld.config.settings import privileges
@@ -49,9 +49,6 @@ from gridworld.training.together import Training
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import EXACT, Mdp
 from gridworld.world.metrics import numbers, optimal_numbers
-
-if TYPE_CHECKING:
-    from gridworld.training.wandb_log import WandbLog
 
 CLOCK = {"train_seconds", "evaluation_seconds"}  # the summary's times
 LOGS = {"curve": CURVE, "events": EVENTS}  # that a checkpoint has marks of, and the pattern of their names
@@ -99,13 +96,13 @@ class Session:
         if config.logging.tensorboard:
             self._events = EventWriter(folder, None if state is None else state["marks"]["events"])
         self._origin = {"identity": identity(config, mdp.text()), "environment": environment(config.agent)}
-        self._wandb: WandbLog | None = None
+        self._wandb: Any = None
         if config.logging.wandb:
-            from gridworld.training.wandb_log import WandbLog
+            from gridworld.training.wandb_log import begin
 
-            self._wandb = WandbLog(config, [self._origin["identity"], folder.absolute()], state is not None)
-        self._scalar_logs = [log for log in (self._events, self._wandb) if log is not None]
-        context = make_context(config, mdp, self._write_scalars if self._scalar_logs else None)
+            self._wandb = begin(config, [self._origin["identity"], folder.absolute()], state is not None)
+        self._has_scalars = config.logging.tensorboard or config.logging.wandb
+        context = make_context(config, mdp, self._write_scalars if self._has_scalars else None)
         self._agent: Agent = config.agent.build(context)
         on_built(self._agent)
         self._visits = context.envs.visits
@@ -131,8 +128,10 @@ class Session:
         return every
 
     def _write_scalars(self, values: Mapping[str, float], step: int) -> None:
-        for log in self._scalar_logs:
-            log.scalars(values, step)
+        if self._events is not None:
+            self._events.scalars(values, step)
+        if self._wandb is not None:
+            self._wandb.log({**values, "step": step})
 
     def progress(self) -> dict[str, int | None]:
         """How many steps were made, and how many of them are saved."""
@@ -169,7 +168,7 @@ class Session:
         label = f"{config.agent.name} on {self._evaluator.mdp.name}"
         self._progress = Progress(config.total_timesteps, label, config.logging.progress)
         self._curve.sinks.append(partial(write_row, self._curve_log))
-        if self._scalar_logs:
+        if self._has_scalars:
             self._curve.sinks.append(CurveScalars(self._write_scalars, self._evaluator).write)
         self._curve.sinks += [partial(show_progress, self._progress), self._pictures.write]
 
@@ -269,7 +268,7 @@ class Session:
             events = self._events
             closing += [partial(events.end_session, succeeded), lambda: events.log.sync(), events.close]
         if self._wandb is not None:
-            closing.append(partial(self._wandb.end, succeeded))
+            closing.append(partial(self._wandb.finish, int(not succeeded)))
         ignored = () if succeeded else (OSError, InputError)
         with contextlib.suppress(*ignored), contextlib.ExitStack() as stack:
             for close in reversed(closing):  # all of them, whatever one raises

@@ -55,27 +55,6 @@ def test_tables() -> None:
     assert gridworld.evaluate(q=table, env=WORLD) == expected(table)
 
 
-def test_what_an_environment_may_be() -> None:
-    actions = np.ones(30, dtype=int)
-    by_name = gridworld.evaluate(actions, "classic")
-    env = gym.make(RAW)
-    places = [
-        *(env, gridworld.OneHotObservation(env), gridworld.GridWorldEnv(), load("classic")),
-        *(gym.make_vec(RAW, num_envs=3), gridworld.make_vec_env("classic", n_envs=2)),
-        *(DummyVecEnv([lambda: gym.make(RAW)]), compile_mdp(load("classic"))),
-    ]
-    for place in places:
-        assert gridworld.evaluate(actions, place) == by_name
-    limits = [
-        gym.make(RAW, max_episode_steps=5),
-        gym.make_vec(RAW, num_envs=2, max_episode_steps=5),
-        gridworld.make_vec_env(max_episode_steps=5),
-        DummyVecEnv([lambda: gym.wrappers.TimeLimit(gridworld.GridWorldEnv(), 5)]),
-    ]
-    for limited in limits:
-        assert gridworld.evaluate(actions, limited).outcome.expected_length == 5
-
-
 @pytest.mark.parametrize(
     ("algorithm", "kind"),
     [

@@ -57,18 +57,15 @@ def test_what_a_sweep_shows(swept: gridworld.SweepResult, monkeypatch: pytest.Mo
     assert swept.table == swept.rows
 
 
-def test_a_sweeps_report(swept: gridworld.SweepResult, folder: Path, tmp_path: Path) -> None:
+def test_a_sweeps_report(swept: gridworld.SweepResult, folder: Path) -> None:
     assert swept.report() == folder / "report" / "report.html"
     assert "sarsa" in (folder / "report" / "report.html").read_text()
-    (tmp_path / "mine").touch()
-    with pytest.raises(InputError, match="mine: is not a folder; choose a new one"):
-        swept.report(tmp_path / "mine")
 
 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["agent=dqnn,ppo"], "agent=dqnn: no such choice"),
+        (["agent=dqnn,ppo"], "did you mean dqn or qrdqn?"),
         (["agent"], "agent: is not an override; write KEY=VALUE"),
         (["hydra.sweep.dir=x"], "here the folder is given by folder="),
         ([{"agent.gamma": {1}}], "agent.gamma: must be plain values, has a set"),
@@ -86,7 +83,7 @@ def test_mistakes_in_a_sweep(
 
 def test_folders_of_something_else(swept: gridworld.SweepResult, folder: Path) -> None:
     run = swept.runs[0].folder
-    with pytest.raises(InputError, match="is the folder of a single run; open_run opens it"):
+    with pytest.raises(InputError, match=r"not a sweep's folder, it has no sweep\.json"):
         gridworld.open_sweep(run or "")
     with pytest.raises(InputError, match="is a sweep"):
         gridworld.open_run(folder)
@@ -119,7 +116,7 @@ def test_recordings(tmp_path: Path) -> None:
     with Image.open(tmp_path / "run" / "recording" / "episode.gif") as film:
         assert film.size[0] < 20 * 10
     with pytest.raises(InputError, match="argument --fps: 0: must be from 1 to 100"):
-        gridworld.record(tmp_path / "run", ["policy"], tmp_path / "maps", fps=0)
+        gridworld.record(tmp_path / "run", "policy", out=tmp_path / "maps", fps=0)
     with pytest.raises(
         InputError, match=r"has no folder, so that its files are gone; train it with folder=\.\.\."
     ):
@@ -133,5 +130,5 @@ def test_a_study(tmp_path: Path) -> None:
     assert study.sentence in repr(study)
     found = gridworld.compose(recipe=tmp_path / "study").agent
     assert {f"agent.{key}": getattr(found, key) for key in ("learning_rate",)}.items() <= study.values.items()
-    with pytest.raises(InputError, match="seed=0,1: a study has one baseline configuration"):
+    with pytest.raises(InputError, match="seed=0,1: a study has one"):
         gridworld.tune("agent=q_learning", seed=range(2), folder=tmp_path / "other")

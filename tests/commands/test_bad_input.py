@@ -4,20 +4,16 @@ The command lines and their sentences are in `bad_input.txt`.
 """
 
 import json
-import logging
 import re
 import sys
-import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from helpers.support import NO_FILES, ROOT, SHORT, configure, train_in
 from hydra.errors import HydraException
 
-from gridworld import commands
-from gridworld.commands import train as train_command
 from gridworld.config.words import sentence
 from gridworld.errors import InputError
 from gridworld.storage.safe_read import sealed
@@ -106,40 +102,18 @@ def test_settings_are_refused_before_anything_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
-Refusal = Callable[[str], str]
-
-
-@pytest.fixture
-def refusal(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> Iterator[Refusal]:
-    """The sentence by which a command line is refused, in this process."""
-    logger = logging.getLogger()
-    handlers, level = logger.handlers[:], logger.level
-
-    def sentence_of(line: str) -> str:
-        name, *words = line.split()
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr("sys.argv", [str(ROOT / "scripts" / name), *words])
-        monkeypatch.setattr(commands, "prepare", lambda: None)
-        monkeypatch.setattr(train_command, "_job_started", threading.Event())
-        with pytest.raises(SystemExit) as ended:
-            commands.call(name.removesuffix(".py"))
-        told = capsys.readouterr()
-        assert (ended.value.code, told.out) == (2, "")
-        return told.err.strip().splitlines()[-1]
-
-    yield sentence_of
-    logger.handlers, logger.level = handlers, level  # Hydra has its own
-
-
 @pytest.mark.parametrize(
     ("line", "words"),
     [row for row in REFUSED if OF_THE_COMMAND.search(row[0])],
     ids=lambda value: value[:60],
 )
 def test_train_refuses_before_it_writes(
-    line: str, words: str, files: Path, tmp_path: Path, refusal: Refusal, monkeypatch: pytest.MonkeyPatch
+    line: str,
+    words: str,
+    files: Path,
+    tmp_path: Path,
+    refusal: Callable[[str], str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.syspath_prepend(files / "conf")
     assert words in refusal(f"train.py {line}".replace("{conf}", str(files / "conf")))
@@ -157,7 +131,9 @@ def test_the_largest_rewards_are_calculated_with_without_an_overflow(tmp_path: P
             assert summary["optimal_goal_probability"] == 1
 
 
-def test_a_folder_that_cannot_be_a_runs_is_refused_and_left_alone(tmp_path: Path, refusal: Refusal) -> None:
+def test_a_folder_that_cannot_be_a_runs_is_refused_and_left_alone(
+    tmp_path: Path, refusal: Callable[[str], str]
+) -> None:
     for name, content in (("file", ""), ("sweep/sweep.json", "{}"), ("used/checkpoints/1000.state", "")):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(content)
@@ -175,7 +151,9 @@ def test_a_folder_that_cannot_be_a_runs_is_refused_and_left_alone(tmp_path: Path
 
 
 @pytest.mark.parametrize(("line", "words"), table("train.py -m"))
-def test_a_sweep_is_refused_before_it_writes(line: str, words: str, tmp_path: Path, refusal: Refusal) -> None:
+def test_a_sweep_is_refused_before_it_writes(
+    line: str, words: str, tmp_path: Path, refusal: Callable[[str], str]
+) -> None:
     (tmp_path / "used").mkdir()
     (tmp_path / "used" / "manifest.json").write_text("{}")
     assert words in refusal(f"train.py -m {line}")
@@ -184,7 +162,7 @@ def test_a_sweep_is_refused_before_it_writes(line: str, words: str, tmp_path: Pa
 
 @pytest.mark.parametrize(("launcher", "package"), [("slurm", "submitit"), ("ray", "ray")])
 def test_a_launcher_that_is_not_installed_names_its_extra(
-    launcher: str, package: str, refusal: Refusal, monkeypatch: pytest.MonkeyPatch
+    launcher: str, package: str, refusal: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     told = f"{package} is not installed; pip install -e '{ROOT}[{launcher}]'"
@@ -193,7 +171,7 @@ def test_a_launcher_that_is_not_installed_names_its_extra(
 
 
 def test_slurm_is_started_where_it_is(
-    tmp_path: Path, refusal: Refusal, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, refusal: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     told = refusal("train.py -m seed=0,1 hydra/launcher=slurm")
@@ -202,7 +180,7 @@ def test_slurm_is_started_where_it_is(
 
 @pytest.mark.parametrize(("line", "words"), table("the other scripts"))
 def test_the_other_scripts_refuse_too(
-    line: str, words: str, tmp_path: Path, refusal: Refusal, monkeypatch: pytest.MonkeyPatch
+    line: str, words: str, tmp_path: Path, refusal: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.setenv(name, "")

@@ -150,7 +150,7 @@ class Reader:
 
     def _run(self, line: str) -> subprocess.CompletedProcess[str]:
         words = shlex.split(line)
-        variables = dict(word.split("=", 1) for word in words if word.startswith("PYTHONPATH="))
+        variables = dict(word.split("=", 1) for word in words if re.match(r"[A-Z_]+=", word))
         program, *words = words[len(variables) :]
         if program == "tensorboard":
             reads = str(Path(sys.executable).with_name(program))

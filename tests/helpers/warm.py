@@ -34,7 +34,7 @@ import numpy as np
 import PIL.Image
 import torch
 from helpers.forks import megabytes
-from helpers.quickly import collapse_memory, compose_quickly
+from helpers.quickly import compose_quickly
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
@@ -102,7 +102,6 @@ def _prepare() -> None:
     for finalizer in list(weakref.finalize._registry):  # type: ignore[attr-defined]
         finalizer.atexit = False  # what imported modules do at the end, for torch half of a script's time
     gc.freeze()  # so that a fork shares what is there
-    collapse_memory()
     gc.set_threshold(50_000)
     gc.enable()
 

@@ -126,7 +126,7 @@ def test_curves_over_seeds_are_of_the_runs_that_are_left(
     for run in runs.iterdir():
         os.truncate(run / "summary.json", 1)
     assert write_over_seeds(runs, runs) is None
-    assert "_over_seeds: is not written, nothing to report: " in capsys.readouterr().err
+    assert "_over_seeds: cannot be written, nothing to report: " in capsys.readouterr().err
     with pytest.raises(InputError, match=r"nothing to report: .*0/summary.json: .*sarsa1/summary.json: "):
         gather([runs])
 

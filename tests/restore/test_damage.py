@@ -23,7 +23,6 @@ from helpers.runs_folder import Maker, write_study, write_sweep
 from helpers.support import SHORT, train_in
 
 from gridworld.commands import jobs as jobs_command
-from gridworld.commands import record as record_command
 from gridworld.config.train import PICTURES
 from gridworld.errors import InputError
 from gridworld.report import tuning_study as tuning
@@ -67,7 +66,7 @@ def evaluated(folder: Path) -> str:
 def recorded(folder: Path) -> str:
     saved = SavedRun(folder / "run")
     visits = read_visits(saved.run, saved.mdp.neighbour.shape)
-    return f"{record_command._SavedSubject(saved, False).steps} {visits}"
+    return f"{saved.steps()} {visits}"
 
 
 def gone_on(folder: Path) -> str:
@@ -260,7 +259,7 @@ def test_a_checkpoint_of_an_impossible_number_is_passed_over(
         path.rename(path.with_name(f"{value}.state"))
     go_on(tmp_path / "run")
     told = capsys.readouterr().err
-    assert ".state: skipped, it " in told
+    assert ".state: skipped, its " in told
     assert read_run(tmp_path / "run").is_finished
 
 
@@ -271,5 +270,5 @@ def test_a_study_with_a_number_beyond_all_is_refused(value: str, good: Path, tmp
         in_json(tmp_path / "study" / name, importances={"agent.gamma": 7531}, about={"objective": 7531})
         text = (tmp_path / "study" / name).read_text()
         (tmp_path / "study" / name).write_text(text.replace("7531", value))
-        with pytest.raises(InputError, match=f"{name}: is not JSON, .* is too large a number"):
+        with pytest.raises(InputError, match=f"{name}: is not JSON, .* is too large"):
             telling(tmp_path)

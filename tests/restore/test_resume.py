@@ -62,9 +62,7 @@ CASES = {
         "stratified_draws=true",
         "env.slip=0.1",
     ],
-    "ppo stock": [
-        *(*SHORT["ppo"], "agent.engine=stock", "agent.log_interval=2", "n_envs=8", "total_timesteps=1000"),
-    ],
+    "ppo stock": [*SHORT["ppo"], "agent.engine=stock", "agent.log_interval=2", "n_envs=8"],
     **{f"{name} stock": [*SHORT[name], "agent.engine=stock"] for name in ("a2c", "qrdqn", "trpo")},
     **{name: SHORT[name] for name in ("a2c", "qrdqn", "trpo", "q_learning", "sarsa", "expected_sarsa")},
 }

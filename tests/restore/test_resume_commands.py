@@ -194,7 +194,7 @@ def test_a_finished_run_without_a_checkpoint_that_fits_is_kept(harm: str, total:
             curve.close()
         file.write_bytes(b"" if harm == "empty" else encode(state))
     before = left_there(tmp_path / "run")
-    with pytest.raises(InputError, match=r"is finished, but checkpoints/ has no checkpoint .* a new run in"):
+    with pytest.raises(InputError, match=r"is finished, but checkpoints/ has no checkpoint .*a new run of"):
         go_on(tmp_path / "run", total)
     assert left_there(tmp_path / "run") == before
 
@@ -244,7 +244,7 @@ def test_another_commit_is_told_and_noted(
     monkeypatch.setattr(provenance, "source", lambda: Source("abc", b"some changes"))
     go_on(stopped)
     told = capsys.readouterr().err
-    assert "run: the source code has changed, as its manifest will say: commit: " in told
+    assert "run: the source code has changed, as its manifest will say:  commit: " in told
     assert " then, abc now; uncommitted source: " in told
     (again,) = manifest(stopped)["resumed"]  # type: ignore[misc, attr-defined]
     assert again["git"]["commit"] == "abc"
@@ -263,7 +263,7 @@ def test_a_map_that_changed_meanwhile(tmp_path: Path, monkeypatch: pytest.Monkey
     world.write_text("S..\nT.G\n")
     refused = script("train.py", *words, cwd=tmp_path)
     assert refused.returncode == 2
-    assert "the world world.txt has changed since" in refused.stderr
+    assert "(the world world.txt has changed); choose another" in refused.stderr
     done = script("train.py", "resume=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "its world world.txt has changed; the run continues with its original world" in done.stderr

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 from helpers.resuming import begin, begin_all, differences, go_on, left_behind
-from helpers.support import ROOT, script, start
+from helpers.support import ROOT, script, start, wait_for
 from helpers.sweeps import differing, logged, rows
-from test_sweep import WORKERS, wait_for
+from test_sweep import WORKERS
 
 from gridworld.errors import InputError
 from gridworld.run.checkpoints import Checkpoints
@@ -71,7 +71,7 @@ def test_members_that_are_refused_or_diverge_leave_the_others_alone(tmp_path: Pa
     assert "training diverged at update" in together["agent.learning_rate=1e+20"]["error"]
     assert differing(tmp_path / "together", tmp_path / "calm") == {}
     assert logged(tmp_path / "together" / "agent.learning_rate=0.001") == [
-        "INFO begins: ",
+        "INFO starts: ",
         "INFO finished after 1,536 steps",
     ]
 
@@ -155,7 +155,7 @@ def test_a_signal_interrupts_all_and_nothing_is_lost(
     folder = tmp_path / "sweep"
     words = ("-m", *LONG, *launcher, "checkpoint.every=1024", "hydra.sweep.dir=sweep")
     with start("train.py", *words, cwd=tmp_path) as process:
-        wait_for(lambda: len(list(folder.glob("*/checkpoints/*.state"))) >= 3)
+        wait_for(lambda: len(list(folder.glob("*/checkpoints/*.state"))) >= 3, "checkpoints", process)
         for _ in range(times):
             os.killpg(process.pid, number)
         _, errors = process.communicate(timeout=180)

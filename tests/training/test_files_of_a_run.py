@@ -31,7 +31,7 @@ finally:
 
 
 def test_a_run_that_was_never_interrupted_calls_few_files_and_none_of_resuming(tmp_path: Path) -> None:
-    words = [str(ROOT / "scripts" / "train.py"), "agent=dqn", "hydra.run.dir=run", "evaluation.stop_after=1"]
+    words = [str(ROOT / "scripts" / "train.py"), "agent=dqn", "hydra.run.dir=run"]
     done = subprocess.run(
         [sys.executable, "-c", COUNTED, str(ROOT / "gridworld"), *words],
         cwd=tmp_path,

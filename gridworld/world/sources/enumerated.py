@@ -84,14 +84,6 @@ def enumerate_env(
     return replace(mdp, max_episode_steps=found_limit)
 
 
-class _Place(NamedTuple):
-    """Where pictures have a state: row and column from 0, in the panel of all states that face that way."""
-
-    row: int
-    column: int
-    facing: str
-
-
 class _Step(NamedTuple):
     """What an action does: the number of the state that follows, and what the environment returns."""
 
@@ -109,7 +101,7 @@ class _State:
     depth: int  # steps from the start
     copy: bytes  # b"" where it is no longer needed
     name: str
-    place: _Place | None
+    place: tuple[str, int, int] | None  # which way the agent faces, row and column
     observation: NDArray[Any] | None
     is_open: bool = False  # an episode goes on in it
     steps: Sequence[_Step] = ()  # of each action; empty where none was tried
@@ -260,7 +252,7 @@ class _Search:
         check_memory(f"env.id={self.name}", self._num_bytes)
         return state
 
-    def _named(self) -> tuple[str, _Place | None]:
+    def _named(self) -> tuple[str, tuple[str, int, int] | None]:
         """What a reader calls its state, and its place, by attributes that minigrid's environments have."""
         place, direction = (getattr(self._env, name, None) for name in ("agent_pos", "agent_dir"))
         try:
@@ -271,7 +263,7 @@ class _Search:
         if carried := getattr(getattr(self._env, "carrying", None), "type", None):
             facing += f", carrying a {carried}"
         time = "" if "step_count" in self.ignore else f", step {getattr(self._env, 'step_count', '?')}"
-        return f"row {row + 1}, column {column + 1}, {facing}{time}", _Place(row, column, facing)
+        return f"row {row + 1}, column {column + 1}, {facing}{time}", (facing, row, column)
 
     def _as_array(self, observation: Any) -> NDArray[Any] | None:
         """An observation as an array, of a Dict the `image`; None where there is none."""
@@ -318,9 +310,9 @@ class _Search:
         paid = terminated & (reward > 0)
         observations = [each.observation for each in self.states if each.observation is not None]
         found = [each.place for each in self.states if each.place is not None]
-        panels, places = list(dict.fromkeys(each.facing for each in found)), None
+        panels, places = list(dict.fromkeys(facing for facing, _, _ in found)), None
         if len(found) == len(self.states):
-            places = np.array([(panels.index(each.facing), each.row, each.column) for each in found])
+            places = np.array([(panels.index(facing), row, column) for facing, row, column in found])
             places[:, 1:] -= places[:, 1:].min(axis=0)  # without the walls around the room
         check_memory(f"env.id={self.name}: its own observations", sum(each.nbytes for each in observations))
         mdp = mdp_from_outcomes(
