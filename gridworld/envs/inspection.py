@@ -26,9 +26,9 @@ from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load, positive_int
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import verified
-from gridworld.world.snapshots import alike, same
+from gridworld.world.reach import alike, same
 from gridworld.world.sources.gymnasium_table import compile_table, has_table
-from gridworld.world.wrappers import NEUTRAL, Wrapped, known_class, step_limit, wrappers_of
+from gridworld.world.wrappers import NEUTRAL, STEPPED_BY, Wrapped, known_class, step_limit, wrappers_of
 
 # What a batch is, by the class whose methods it runs.
 _GYMNASIUM, _SB3 = "gymnasium.wrappers.vector", "stable_baselines3.common.vec_env"
@@ -135,7 +135,8 @@ def _single(env: gym.Env[Any, Any]) -> Task:
             "with its steps, so nothing exact is known of it; make it a gymnasium.Wrapper"
         )
     if isinstance(mdp, GridMdp):
-        if known_class(real, {"gridworld.envs.env:GridWorldEnv": _NATIVE}, ("step", "reset")) is None:
+        methods = (*STEPPED_BY, "mdp", "np_random")
+        if known_class(real, {"gridworld.envs.env:GridWorldEnv": _NATIVE}, methods) is None:
             raise InputError(
                 f"env: {type(real).__name__} has its own step() or reset(), so it may be another task than "
                 "its map says; leave them as they are in GridWorldEnv, or wrap it"
@@ -230,7 +231,7 @@ def _is_copy(one: gym.Env[Any, Any], other: gym.Env[Any, Any]) -> bool:
 
     def is_like(one: Any, other: Any) -> bool:
         is_known = one is mine[-1] or type(one).__module__.partition(".")[0] in _LIBRARIES
-        return alike(one, other, _OF_AN_EPISODE if is_known else _OF_A_WRAPPER)
+        return alike(one, other, _OF_AN_EPISODE if is_known else _OF_A_WRAPPER, (mine, its))
 
     return len(mine) == len(its) and all(map(is_like, mine, its))
 

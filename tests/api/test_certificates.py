@@ -2,6 +2,8 @@
 
 import functools
 import random
+import time
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -10,11 +12,13 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces, wrappers
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from sb3_contrib import MaskablePPO
 from sb3_contrib.common.wrappers import ActionMasker
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.utils import constant_fn
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
@@ -288,27 +292,24 @@ class Mixing(VecEnvWrapper):
         return self.venv.reset()
 
 
-class ByDefault(gym.RewardWrapper):
-    def reward(self, reward: Any, count: Any = [0]) -> float:  # noqa: B006
-        count[0] += 1
-        return float(reward) - (count[0] > 10**6)
+class Elusive(gym.Wrapper):
+    """Shows another step to whoever asks for it."""
+
+    def __getattribute__(self, name: str) -> Any:
+        return super().__getattribute__("env").step if name == "step" else super().__getattribute__(name)
 
 
-class ByClass(gym.RewardWrapper):
-    calls = 0
+class Indirect(gym.Wrapper):
+    """Says itself which environment is below it."""
 
-    def reward(self, reward: Any) -> float:
-        type(self).calls += 1
-        return float(reward) - (self.calls > 10**6)
+    env = property(lambda self: self.held, lambda self, env: setattr(self, "held", env))
 
 
-def rarely() -> bool:
-    return bool(DRAWS.random() < 1e-5)
-
-
-def by_generator(env: Any) -> Any:
-    ticks = (number > 10**6 for number in range(10**9))
-    return paid_by(lambda r: float(r) - next(ticks))(env)
+def constant(value: float) -> Any:
+    """A closure of an installed library."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return constant_fn(value)
 
 
 class Delegating(gym.Env):
@@ -372,10 +373,17 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {  # what makes an environme
         lambda self, r: float(r) - 0.1 * (self.get_wrapper_attr("_elapsed_steps") > 3))(lake()), _ENV),
     "what a Monitor has noted":
         (lambda: acting(lambda self, a: a if len(self.env.rewards) < 3 else 0)(Monitor(lake())), _ENV),
-    "a count in a default": (lambda: ByDefault(lake()), _ENV),
-    "a count in a class": (lambda: ByClass(lake()), _ENV),
-    "chance in a helper": (lambda: acting(lambda self, a: 0 if rarely() else a)(lake()), _ENV),
-    "a generator": (lambda: by_generator(lake()), _ENV),
+    "what a Monitor has counted":
+        (lambda: paying(lambda self, r: r + self.env.total_steps)(Monitor(lake())), "at total_steps"),
+    "the state, where it can be read":
+        (lambda: paying(lambda self, r: getattr(self.unwrapped, "state", r))(lake()), "at unwrapped"),
+    "a clock": (lambda: paid_by(lambda r: r + (time.monotonic() < 0))(lake()), "refers to time.monotonic"),
+    "a step by another way": (lambda: Elusive(lake()), _STEP),
+    "an environment by another way": (lambda: Indirect(lake()), _STEP),
+    "a grid that is asked by another way":
+        (own(gridworld.GridWorldEnv, mdp=property(lambda self: self._mdp)), _STEP),
+    "copies with another function of a library":
+        (lambda: DummyVecEnv([lambda k=k: paid_by(constant(k))(lake()) for k in (1, -1)]), "is another task"),
     "what is no wrapper": (Delegating, _ENV),
     "an action that is a float":
         (lambda: wrappers.TransformAction(lake(), float, spaces.Discrete(4)), _ENV),
@@ -394,6 +402,14 @@ def test_what_may_be_another_task_is_refused(what: str) -> None:
     make, told = REFUSED[what]
     with pytest.raises(InputError, match=told):
         gridworld.evaluate(BEST, make())
+
+
+def test_a_class_whose_step_is_replaced_is_compared_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    gridworld.evaluate(BEST, lake())
+    step = FrozenLakeEnv.step
+    monkeypatch.setattr(FrozenLakeEnv, "step", lambda self, action: step(self, (action + 1) % 4))
+    with pytest.raises(InputError, match="leaves its own table"):
+        gridworld.evaluate(BEST, lake())
 
 
 def test_copies_of_a_batch_must_be_one_task() -> None:

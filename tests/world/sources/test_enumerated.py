@@ -233,7 +233,7 @@ def test_states_beyond_the_step_limit_that_have_an_end_are_found() -> None:
         ("Corridor-v0", {"variant": "random"}, "draws a random number"),
         ("Corridor-v0", {"variant": "global"}, "draws a random number"),
         ("Corridor-v0", {"variant": "layout"}, "a reset leads to another state with another seed"),
-        ("ShortCorridor-v0", {"variant": "hidden"}, "is random, has state outside of its attributes"),
+        ("ShortCorridor-v0", {"variant": "hidden"}, "a step changes what is outside of its attributes"),
         ("Corridor-v0", {"variant": "endless"}, "more than 300 states .* since its past keeps changing"),
         ("Corridor-v0", {}, r"since its steps keeps changing; .* e.g. env.ignore=\[steps\]"),
         ("Corridor-v0", {"variant": "decay", "limit": 200}, "more than 300 states .* steps keeps changing"),
