@@ -158,16 +158,15 @@ class Reach:
 
     def _named(self) -> Iterator[tuple[Mapping[str, Any], str]]:
         """Every place where a name that is used may be meant."""
-        names = self._names
-        if self._package is not None:
-            names = {name for name in names if not name.startswith(("render", "_render", "close"))}
+        shows = ("render", "_render", "close") if self._package else ()  # what is no part of a step
+        names = sorted(name for name in self._names if not name.startswith(shows))
         mine: Any = vars(self._owner)
-        yield from ((mine, name) for name in (names | mine.keys() if self._by_name else names) - {"env"})
-        for module in self._modules:
-            yield from ((module, name) for name in (*names, "__getattr__"))
+        yield from ((mine, name) for name in [*names, *(mine if self._by_name else ())] if name != "env")
+        yield from ((module, name) for module in self._modules for name in [*names, "__getattr__"])
         for held, is_called in self._classes.values():
-            of_python = {name for name in held if name.startswith("__") and isinstance(held[name], _CODE)}
-            yield from ((held, name) for name in names | (of_python if is_called else of_python - _MAKING))
+            special = [name for name in held if name.startswith("__") and isinstance(held[name], _CODE)]
+            left_out = () if is_called else _MAKING
+            yield from ((held, name) for name in [*names, *special] if name not in left_out)
 
     def _look_up(self, place: Mapping[str, Any], name: str) -> None:
         key = id(place), name
@@ -340,20 +339,3 @@ def same(one: Any, other: Any) -> bool:
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
     return np.array_equal(np.asarray(one), np.asarray(other))
-
-
-def alike(one: Any, other: Any, without: Iterable[str], known: tuple[list[Any], list[Any]]) -> bool:
-    """Whether two objects of one class hold the same values and functions, but for some attributes.
-
-    `known` are objects that each may refer to, in the same order.
-    """
-    if type(one) is not type(other):
-        return False
-    try:
-        mine, theirs = (
-            digest(sorted(item for item in vars(each).items() if item[0] not in without), others, {})
-            for each, others in zip((one, other), known, strict=True)
-        )
-    except UnreadableError:  # may differ
-        return False
-    return mine == theirs

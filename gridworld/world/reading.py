@@ -55,24 +55,12 @@ OF_A_CLASS = (MethodDescriptorType, WrapperDescriptorType, ClassMethodDescriptor
 _SHORT = 16  # numbers; a position is the same whether it is a tuple or an array
 # Libraries whose code is a function of its arguments, but for what is left out again.
 _PURE = {
-    *(
-        "abc",
-        "array",
-        "bisect",
-        "builtins",
-        "cmath",
-        "collections",
-        "copy",
-        "cv2",
-        "dataclasses",
-        "decimal",
-        "enum",
-    ),
-    *("fractions", "functools", "itertools", "math", "numbers", "numpy", "operator", "scipy", "statistics"),
-    *("string", "types", "typing", "_operator", "_functools", "_collections", "_bisect", "_statistics"),
+    *("abc", "array", "bisect", "builtins", "cmath", "collections", "copy", "cv2", "dataclasses", "decimal"),
+    *("enum", "fractions", "functools", "itertools", "math", "numbers", "numpy", "operator", "scipy"),
+    *("statistics", "string", "types", "typing", "_operator", "_functools", "_collections", "_bisect"),
+    *("_statistics", "gymnasium.core", "gymnasium.spaces"),
 }
-_PURE_PARTS = ("gymnasium.core", "gymnasium.spaces")
-_IMPURE_PARTS = ("numpy.random", "scipy.stats")
+_IMPURE = {"numpy.random", "scipy.stats"}
 
 Way = Callable[[Any], tuple[Any, Sequence[Any]]]  # of a value: what stands for its kind, and its parts
 
@@ -83,22 +71,17 @@ class UnreadableError(TypeError):
 
 def is_pure(module: Any) -> bool:
     """Whether all that a module's code does is a function of its arguments."""
-    name = f"{module}."
-    if name.startswith(tuple(f"{part}." for part in _PURE_PARTS)):
-        return True
-    return name.partition(".")[0] in _PURE and not name.startswith(
-        tuple(f"{each}." for each in _IMPURE_PARTS)
-    )
+    parts = str(module).split(".")
+    names = {parts[0], ".".join(parts[:2])}
+    return bool(names & _PURE) and not names & _IMPURE
 
 
 def imported_name(value: Any) -> str | None:
     """The dotted name under which a function or class is found in its module; None: it is not found."""
-    modules = (
-        ("numpy", "scipy.special") if isinstance(value, np.ufunc) else (getattr(value, "__module__", None),)
-    )
     name = getattr(value, "__qualname__", None) or getattr(value, "__name__", None)
-    for module in modules:
-        found: Any = sys.modules.get(module) if isinstance(module, str) and isinstance(name, str) else None
+    own = getattr(value, "__module__", None)
+    for module in ("numpy", "scipy.special") if isinstance(value, np.ufunc) else (own,):
+        found = sys.modules.get(str(module))
         for part in str(name).split("."):
             found = getattr(found, "__dict__", {}).get(part)
         if found is value or getattr(found, "__func__", None) is value:
@@ -166,11 +149,11 @@ def _by_layout(kind: type, value: Any) -> Way:
         state = object.__getstate__(value)
         return [part for each in (state if type(state) is tuple else (state,)) for part in _sorted(each)]
 
-    if base is list and kind is list:
+    if kind is list:
         return lambda value: (None, value)
     if base is object:
         return lambda value: (name, held(value))
-    contents: Way = _CONTENTS.get(base, lambda value: base.__getnewargs__(value))  # type: ignore[attr-defined]
+    contents = _CONTENTS.get(base) or base.__getnewargs__  # type: ignore[attr-defined]
     if kind is base:
         return lambda value: (name, contents(value))
     return lambda value: (name, [tuple(contents(value)), *held(value)])
@@ -224,15 +207,7 @@ def _array(value: Any) -> tuple[Any, Sequence[Any]]:
         return "objects", (value.shape, *value.ravel().tolist())
     if value.ndim == 1 and value.size <= _SHORT and value.dtype.kind in "biufcSU":
         return None, value.tolist()
-    return "array", (
-        str(value.dtype) if value.dtype.kind == "V" else value.dtype.str,
-        value.shape,
-        value.tobytes(),
-    )
-
-
-def _generator(value: Any) -> tuple[Any, Sequence[Any]]:
-    return type(value).__name__, (generator_state(value),)
+    return "array", (str(value.dtype.descr), value.shape, value.tobytes())
 
 
 def generator_state(generator: Any) -> Any:
@@ -271,8 +246,8 @@ def _function(value: Any) -> tuple[Any, Sequence[Any]]:
     name = imported_name(value)
     if name is not None and is_pure(value.__module__):
         return name, ()
-    code = () if name is not None else (_code(value.__code__), id(value.__globals__))
-    return (value.__module__, value.__qualname__), [*code, *held_by(value)]
+    globals_of = 0 if name is not None else id(value.__globals__)
+    return (value.__module__, value.__qualname__), [_code(value.__code__), globals_of, *held_by(value)]
 
 
 def _builtin(value: Any) -> tuple[Any, Sequence[Any]]:
@@ -288,10 +263,6 @@ def _attributes(value: Any) -> tuple[Any, Sequence[Any]]:
 def _reduced(value: Any) -> tuple[Any, Sequence[Any]]:
     made_by = value.__reduce_ex__(4)
     return _label(type(value)), [list(each) if hasattr(each, "__next__") else each for each in made_by]
-
-
-def _of_a_class(value: Any) -> tuple[Any, Sequence[Any]]:
-    return value.__name__, (value.__objclass__,)
 
 
 _DERIVED: tuple[tuple[type, Way], ...] = (
@@ -316,6 +287,10 @@ _WAYS: dict[type, Way] = {
     classmethod: lambda value: ("of a class", (value.__func__,)),
     functools.cached_property: lambda value: ("kept property", (value.func,)),
 }
-_WAYS |= dict.fromkeys(GENERATORS, _generator) | dict.fromkeys(_REDUCED, _reduced)
-_WAYS |= dict.fromkeys((*OF_A_CLASS, GetSetDescriptorType, MemberDescriptorType), _of_a_class)
+_WAYS |= dict.fromkeys(GENERATORS, lambda value: (type(value).__name__, (generator_state(value),)))
+_WAYS |= dict.fromkeys(_REDUCED, _reduced)
+_WAYS |= dict.fromkeys(
+    (*OF_A_CLASS, GetSetDescriptorType, MemberDescriptorType),
+    lambda value: (value.__name__, (value.__objclass__,)),
+)
 _OF_KEPT = {_attributes, _function, _builtin}

@@ -27,7 +27,7 @@ import torch
 from stable_baselines3.common.utils import ConstantSchedule, constant_fn
 
 from gridworld.errors import InputError
-from gridworld.world.reach import alike, asked
+from gridworld.world.reach import asked
 from gridworld.world.reading import UnreadableError, digest
 
 __all__ = ["os", "random", "secrets"]  # which texts below name
@@ -156,7 +156,7 @@ REFUSED: dict[str, tuple[Any, str]] = {  # a wrapper, and what is said of it
     "what came before": (own(twice_in_a_row), "does not always give the same"),
     "the process's settings": (
         paying(that("os.environ['N'] = str(reward) + os.environ.get('N', '')")),
-        "putenv",
+        "refers to posix",
     ),
     "an object that hides": (paying(Counter()), _COUNTER),
     "a method of one": (paying(Counter().__call__), _COUNTER),
@@ -307,16 +307,3 @@ def test_what_differs_is_told_apart_or_refused() -> None:
     for name, make in DIFFERENT.items():
         assert digest(make(1)) != digest(make(2)), name
     assert digest((1, 2)) == digest([1, 2]) == digest(np.array([1, 2]))
-
-
-def test_what_is_made_alike() -> None:
-    lake = gym.make("FrozenLake-v1")
-
-    def made(function: Any) -> Any:
-        return gym.wrappers.TransformReward(lake, function)
-
-    for maker in (constant, lambda factor: lambda reward: factor * reward):
-        one, same, other = made(maker(2.0)), made(maker(2.0)), made(maker(-2.0))
-        assert alike(one, same, ("env",), ([lake], [lake]))
-        assert not alike(one, other, ("env",), ([lake], [lake]))
-    assert not alike(made(float), lake, (), ([lake], [lake]))
