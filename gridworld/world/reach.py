@@ -42,19 +42,8 @@ SO_UNKNOWN = (
     ", so what it makes of the task is not exactly known; "
     "leave it out, or make it a function of its argument alone"
 )
-_IMPURE = {
-    "open",
-    "input",
-    "eval",
-    "exec",
-    "compile",
-    "__import__",
-    "globals",
-    "locals",
-    "vars",
-    "id",
-    "hash",
-    "breakpoint",
+_IMPURE = {  # of what is built in
+    *("open", "input", "eval", "exec", "compile", "__import__", "globals", "locals", "vars", "id"),
 }
 _BY_NAME = {"getattr", "hasattr", "setattr", "delattr", "__dict__"}  # who may come to any attribute
 # What leaves a step to chance, as messages of `UnreadableError` begin; and modules that have it.

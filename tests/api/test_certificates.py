@@ -1,7 +1,6 @@
 """A score is of what was given: wrappers, every copy of a batch, what `predict` does. Truth is by playing."""
 
 import functools
-import random
 import time
 import warnings
 from collections.abc import Callable
@@ -98,22 +97,6 @@ class Fewer(gym.ActionWrapper):
         return 2 - int(action)
 
 
-class Alternating(gym.ActionWrapper):
-    turn = 0
-
-    def action(self, action: Any) -> Any:
-        self.turn += 1
-        return (action + self.turn // 5000) % 4
-
-
-class Tired(gym.RewardWrapper):
-    steps = 0
-
-    def reward(self, reward: Any) -> float:
-        self.steps += 1
-        return float(reward) - 0.001 * (self.steps // 3000)
-
-
 class Costly(gym.ObservationWrapper):
     """An observation wrapper by name, and more by its step."""
 
@@ -148,10 +131,6 @@ def paid_by(reward: Callable[[Any], Any]) -> Make:
     return lambda env: wrappers.TransformReward(env, reward)
 
 
-def by_closure(env: Any) -> Any:
-    return paid_by(lambda r: float(r) - 0.1 * (getattr(env.unwrapped, "s", 0) == 1))(env)
-
-
 NEUTRAL: dict[str, Make] = {
     "Monitor": Monitor,
     "a Monitor of one's own that steps as it does": own(Monitor, close=lambda self: None),
@@ -179,19 +158,12 @@ COMPILED: dict[str, Make] = {
 }
 # fmt: off
 UNKNOWN: dict[str, Make] = {
-    "random actions": acting(
-        lambda self, a: self.action_space.sample() if self.np_random.random() < 0.3 else a),
-    "random actions, one in ten thousand": acting(lambda self, a: 0 if DRAWS.random() < 1e-4 else a),
     "random actions in a step of its own": Restless,
     "StickyAction": lambda env: wrappers.StickyAction(env, 0.2),
     "RepeatAction": lambda env: wrappers.RepeatAction(env, 2),
     "MaxAndSkipObservation": lambda env: wrappers.MaxAndSkipObservation(env, 2),
-    "an action that depends on time": Alternating,
     "an action that depends on the state": acting(lambda self, a: 0 if state_of(self) == 1 else a),
-    "a reward that depends on time": Tired,
     "a reward that depends on the state": paying(lambda self, r: float(r) + (state_of(self) in (4, 8))),
-    "a reward that sees through a closure": by_closure,
-    "a random reward": paid_by(lambda r: float(r) - (random.random() < 1e-4)),
     "NormalizeReward": wrappers.NormalizeReward,
     "an observation wrapper with a step": Costly,
     "a reset of its own": Elsewhere,
@@ -369,10 +341,6 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {  # what makes an environme
     "a batch that pays": (lambda: wrappers.vector.TransformReward(native(), lambda r: -r), _BATCH),
     "a batch that scales": (lambda: wrappers.vector.NormalizeReward(SyncVectorEnv([lake])), _BATCH),
     "a batch that shows otherwise": (lambda: Saving([lake]), _ENV),
-    "an elapsed time": (lambda: paying(
-        lambda self, r: float(r) - 0.1 * (self.get_wrapper_attr("_elapsed_steps") > 3))(lake()), _ENV),
-    "what a Monitor has noted":
-        (lambda: acting(lambda self, a: a if len(self.env.rewards) < 3 else 0)(Monitor(lake())), _ENV),
     "what a Monitor has counted":
         (lambda: paying(lambda self, r: r + self.env.total_steps)(Monitor(lake())), "at total_steps"),
     "the state, where it can be read":
