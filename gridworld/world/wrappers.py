@@ -35,7 +35,7 @@ from gridworld.world.reach import SO_UNKNOWN, Reach, asked, same
 from gridworld.world.solver import backup, swept_values
 
 NEUTRAL, LIMIT, MEMORY = "neutral", "time limit", "memory"
-_STEPS = 2000  # of the copy beside the tables
+_STEPS, _MASKED_STEPS = 500, 2000  # of the copy beside the tables
 _GAMMA = 0.99
 _SEED = 20_261_123
 
@@ -199,7 +199,7 @@ class Wrapped:
                     f"{SO_UNKNOWN}"
                 )
 
-        self._check_steps(compare)
+        self._check_steps(compare, _MASKED_STEPS)
         return found
 
     @cached_property
@@ -260,7 +260,7 @@ class Wrapped:
         chosen_tables = {key: getattr(mdp, key)[:, np.array(chosen, dtype=int)] for key in tables}
         return _changed(mdp, action_names=tuple(mdp.action_names[each] for each in chosen), **chosen_tables)
 
-    def _check_steps(self, compare: Callable[[int, Any], None]) -> None:
+    def _check_steps(self, compare: Callable[[int, Any], None], steps: int = _STEPS) -> None:
         """Step the copy beside the tables, along good and random ways.
 
         `compare` is called with every number and what is seen of it.
@@ -268,12 +268,12 @@ class Wrapped:
         env, probe, rng = self._copied, self._probe, np.random.default_rng(_SEED)
         good = backup(self.mdp, swept_values(self.mdp, _GAMMA), _GAMMA).argmax(axis=1).tolist()
         over = True
-        for number in range(_STEPS):
+        for number in range(steps):
             if over:
                 with self._refusing("cannot be reset"):
                     observation = env.reset(seed=None if number else _SEED)[0]
                 compare(probe.number, observation)
-            state, is_random = probe.number, rng.random() < (number // 500) % 3 / 2
+            state, is_random = probe.number, rng.random() < (number // 100) % 3 / 2
             action = int(rng.integers(self.mdp.num_actions)) if is_random else good[state]
             with self._refusing("cannot be stepped"):
                 observation, reward, terminated, truncated, _ = env.step(action)
