@@ -11,7 +11,7 @@ IMAGES = Path(__file__).parent / "images"
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
 COMMANDS = """\
-python scripts/train.py agent=dqn hydra.run.dir=one
+python scripts/train.py agent=dqn recording.cell_size=80 hydra.run.dir=one
 python scripts/train.py -m agent=dqn,ppo 'seed=range(5)' evaluation.every=2000 hydra.sweep.dir=five
 python scripts/report.py five --out report
 python scripts/train.py agent=ppo_sb3_defaults total_timesteps=20000 hydra.run.dir=defaults

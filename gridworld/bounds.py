@@ -35,7 +35,7 @@ class Bounds:
     def __str__(self) -> str:
         low = f"above {self.low}" if self.above else f"at least {self.low}"
         if self.least:
-            return f"0 or of a size from {self.least:g} to {self.high:g}"
+            return f"0, or from {self.least:g} to {self.high:g} in absolute value"
         if self.low == -math.inf:
             return "a finite number" if self.high == math.inf else f"at most {self.high}"
         if self.high == math.inf:
@@ -48,17 +48,13 @@ def discount(key: str, value: float) -> None:
     Bounds(0, 1).check(key, value)
     if NEAREST_GAMMA < value < 1:
         raise InputError(
-            f"{key}={value}: is so near to 1 that rounding hides what a step costs; must be 1, or at most "
+            f"{key}={value}: is so close to 1 that rounding hides the cost of a step; must be 1 or at most "
             f"{NEAREST_GAMMA}"
         )
 
 
 def digits(text: str) -> str:
-    """A number as people write it; a whole one without point and exponent: 1e5 as 100000.
-
-    Raises:
-        ValueError: it is not a number.
-    """
+    """A number as people write it, a whole one without point and exponent: 1e5 as 100000; or `ValueError`."""
     number = float(text)
     is_whole = number.is_integer() and abs(number) <= _LARGEST_EXACT
     return str(int(number)) if is_whole and not text.lstrip("+-").isdecimal() else text

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import shlex
+from pathlib import Path
 
 EXIT_CODE = 2
 DISTRIBUTION = "gridworld-sb3"  # the package's name for pip; on PyPI another project has `gridworld`
@@ -49,12 +51,15 @@ def failure(error: OSError) -> str:
     what = error.strerror or str(error) or type(error).__name__
     if where and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         folder = os.path.dirname(where) or os.curdir
-        what += f"; choose another folder than {folder}, or get the right to write to it"
+        what += f"; choose another folder, or make {folder} writable"
     elif error.errno in (errno.ENOSPC, errno.EDQUOT):
-        what += "; make room there"
+        what += "; free some space there"
     return f"{where}: {what}" if where else what
 
 
 def install_command(extra: str) -> str:
-    """What installs an optional part, whether the package was installed from a checkout or from PyPI."""
-    return f"pip install '{DISTRIBUTION}[{extra}]'"
+    """What installs an optional part, of a checkout or of an installed wheel."""
+    checkout = Path(__file__).parents[1]
+    if (checkout / "pyproject.toml").is_file():
+        return f"pip install -e {shlex.quote(f'{checkout}[{extra}]')}"
+    return f"pip install '{DISTRIBUTION}[{extra}]'"  # pip finds the wheel installed, and adds what is missing

@@ -1,18 +1,21 @@
 """Settings for all tests: no screen, the same examples on every run, and how processes share the tests."""
 
 import gc
+import logging
 import os
 import signal
 import sys
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # before pygame is imported
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # a second thread waits busily for the next product
 
 import pytest
-from helpers.quickly import collapse_memory, compose_quickly
+from helpers.quickly import compose_quickly
 from hypothesis import settings
 
 from gridworld.process import console
@@ -25,6 +28,7 @@ sys.dont_write_bytecode = False
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+ROOT = Path(__file__).resolve().parents[1]
 console._SECONDS_BETWEEN_LINES = 600.0  # no line says that something takes long, as on a busy machine it may
 settings.register_profile("gridworld", derandomize=True, deadline=None, database=None, max_examples=30)
 settings.load_profile("gridworld")
@@ -39,6 +43,33 @@ def _environment() -> Iterator[None]:
     os.environ.update(before)
 
 
+@pytest.fixture
+def refusal(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> Iterator[Callable[[str], str]]:
+    """The sentence that a command line in `tmp_path` is refused with, by a command in this process."""
+    from gridworld import commands
+    from gridworld.commands import train
+
+    logger = logging.getLogger()
+    handlers, level = logger.handlers[:], logger.level
+
+    def sentence_of(line: str) -> str:
+        name, *words = line.split()
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr("sys.argv", [str(ROOT / "scripts" / name), *words])
+        monkeypatch.setattr(commands, "prepare", lambda: None)
+        monkeypatch.setattr(train, "_job_started", threading.Event())
+        with pytest.raises(SystemExit) as ended:
+            commands.call(name.removesuffix(".py"))
+        told = capsys.readouterr()
+        assert (ended.value.code, told.out) == (2, "")
+        return told.err.strip().splitlines()[-1]
+
+    yield sentence_of
+    logger.handlers, logger.level = handlers, level  # Hydra has its own
+
+
 # One after the other: clusters and kills at random moments; and browsers.
 IN_TURN = {
     "clusters": ("sweep/test_sweep_cluster.py", "sweep/test_sweep_kills.py"),
@@ -50,13 +81,13 @@ LONG = (
     *("tune/test_tune.py", "browsers", "config/test_recipes.py", "tune/test_tune_parts.py"),
     *("commands/test_hostile_runs.py", "commands/test_bad_input.py", "config/test_config.py"),
     *("engine/test_populations.py", "api/test_certificates.py", "report/test_report.py"),
-    *("commands/test_commands.py", "process/test_output.py", "restore/test_resume_kills.py"),
+    *("commands/test_commands.py", "process/test_output.py"),
     *("diagnosis/test_sabotage.py", "restore/test_reproduce.py", "restore/test_resume.py"),
     *("checking/test_check.py", "restore/test_resume_commands.py", "commands/test_train_on_worlds.py"),
     *("commands/test_benchmark.py", "export/test_export.py", "training/test_training.py"),
     *("agents/sb3/test_custom_code.py", "engine/test_updates.py", "restore/test_resume_states.py"),
     *("commands/test_console.py", "docs/test_examples.py", "config/test_presets.py"),
-    *("agents/tabular/test_tabular.py", "process/test_forks.py", "api/test_runs.py"),
+    *("agents/tabular/test_tabular.py", "process/test_forks.py", "api/test_runs.py", "api/test_sweeps.py"),
 )
 
 
@@ -97,7 +128,6 @@ def pytest_collection_finish() -> None:
     compose_quickly()
     gc.freeze()
     gc.set_threshold(50_000)
-    collapse_memory()
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -1,5 +1,6 @@
 """The pages of the documentation: every command and every block of code on them runs."""
 
+import ast
 import dataclasses
 import importlib.util
 import re
@@ -48,9 +49,19 @@ TURNS = {
     r"beside": "next to, compared with, in addition to",
     r"seldom": "rarely",
     r"stands? (in|beside)": "is in",
-    r"go(es)? on (with|from)": "resume, continue",
+    r"(go(es)?|went) on\b(?! to)": "resume, continue",
+    r"anew": "again",
+    r"begun": "started",
+    r"there (is|are) no such": "no such",
+    r"put that right": "fix that",
+    r"of one's own|of a function of your own": "your own, custom",
+    r"is at work": "is running",
+    r"otherwise than": "differently from",
+    r"(came|come|comes) to (its|their|the) end": "finish",
+    r"(the )?settings that the search began from": "the baseline",
+    r"if that is meant": "if you mean that",
+    r"close to it are": "close matches",
     r"brings? in": "use",
-    r"of one's own": "your own, custom",
     r"by itself": "automatically, alone",
     r"(came|comes) out": "result",
     r"in the place of": "instead of",
@@ -59,12 +70,26 @@ TURNS = {
 }
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_a_page_uses_the_usual_words(page: Path) -> None:
-    if page.stem == "CHANGELOG":  # what was written stays
-        return
-    text = page.read_text("utf-8")
-    found = {turn: usual for turn, usual in TURNS.items() if re.search(rf"\b({turn})\b", text, re.IGNORECASE)}
+def unusual(text: str) -> dict[str, str]:
+    """The turns in a text, with the usual words."""
+    return {turn: usual for turn, usual in TURNS.items() if re.search(rf"\b({turn})\b", text, re.IGNORECASE)}
+
+
+def test_pages_messages_and_help_use_the_usual_words() -> None:
+    """All strings of the package with a space, except docstrings; a command's docstring is its help."""
+    found = {page.stem: turns for page in PAGES if (turns := unusual(page.read_text("utf-8")))}
+    for path in sorted((ROOT / "gridworld").rglob("*.py")):
+        tree = ast.parse(path.read_text("utf-8"))
+        docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        if path.parent.name == "commands" and isinstance(tree.body[0], ast.Expr):
+            docstrings.remove(id(tree.body[0].value))
+        for node in ast.walk(tree):
+            text = node.value if isinstance(node, ast.Constant) and id(node) not in docstrings else ""
+            if isinstance(text, str) and " " in text and (turns := unusual(text)):
+                found[f"{path.relative_to(ROOT)}:{node.lineno}"] = turns
+    for path in sorted((ROOT / "conf").rglob("*.yaml")):
+        if turns := unusual(path.read_text("utf-8")):
+            found[str(path.relative_to(ROOT))] = turns
     assert not found
 
 

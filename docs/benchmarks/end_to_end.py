@@ -95,9 +95,7 @@ def _certified(agent: str, seeds: range) -> Callable[[], float]:
     """Median over the seeds; a seed that is never certified raises."""
 
     def measure() -> float:
-        from gridworld.agents import family
         from gridworld.config.compose import compose
-        from gridworld.envs.observations import make_observation
         from gridworld.training.learning_curve import LearningCurve
         from gridworld.training.setup import make_context
         from gridworld.world.evaluation import Evaluator
@@ -107,9 +105,7 @@ def _certified(agent: str, seeds: range) -> Callable[[], float]:
             config = compose([f"agent={agent}", f"seed={seed}"])
             mdp = config.env.compile()
             evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
-            made = family(config.agent).build(
-                config.agent, make_context(config, mdp, make_observation(mdp, config.observation.kind))
-            )
+            made = config.agent.build(make_context(config, mdp))
             config.evaluation.every, config.evaluation.stop_after = 1000, 1
             curve = LearningCurve(evaluator, made, config)
             started = time.perf_counter()

@@ -1,25 +1,19 @@
-"""Agents: what learns. A family of algorithms is a package here, with the functions of `Family`.
+"""Agents: what learns. A family of algorithms is a package here, with the schemas of its agents in `SCHEMAS`.
 
-It is found by the `family` of an agent's settings. Importing it, and asking it for its schemas or to check
-settings, must not import torch.
+They are by their names in Hydra's group `agent/schema`. Importing the package must not import torch.
 """
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast
-
-from gridworld.config.fields import MISSING
-from gridworld.errors import InputError
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from gridworld.config.train import AgentConfig, TrainConfig
     from gridworld.envs.observations import ObservationTable
     from gridworld.envs.statistics_env import StatisticsVectorEnv
     from gridworld.storage.serialization import State
@@ -61,13 +55,15 @@ class TrainingContext:
     only_asked: bool = False  # it will not learn, and needs no memory for transitions
 
 
-class Agent(Protocol):
+class Agent(ABC):
     """One agent with its environments."""
 
     @property
+    @abstractmethod
     def model(self) -> Any:
         """What it has learnt, as its library has it: a model of SB3, or a table Q (S, A)."""
 
+    @abstractmethod
     def learn(
         self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
@@ -88,16 +84,21 @@ class Agent(Protocol):
 
     def class_without_state(self) -> str | None:
         """The path of a class of which nobody knows what it keeps, so that `get_state` cannot be complete."""
+        return None
 
+    @abstractmethod
     def get_state(self) -> State:
         """Everything that learning depends on from here, its environments included."""
 
+    @abstractmethod
     def snapshot(self) -> PolicySnapshot:
         """What it has learnt so far, in arrays of their own."""
 
+    @abstractmethod
     def model_file(self) -> bytes:
         """What it has learnt so far, as the content of a model file."""
 
+    @abstractmethod
     def load(self, path: Path) -> None:
         """Take the parameters from a model file; InputError: they cannot be read, or do not fit."""
 
@@ -148,41 +149,5 @@ def misfit(found: Mapping[str, NDArray[Any]], expected: Mapping[str, NDArray[Any
         if is_now != must_be:
             return f"{name} is {is_now}, it must be {must_be}"
         if not np.isfinite(found[name]).all():
-            return f"{name} holds numbers that are not finite"
+            return f"{name} contains numbers that are not finite"
     return None
-
-
-class Family(Protocol):
-    """The functions of an algorithm family's package."""
-
-    def schemas(self) -> dict[str, type[AgentConfig]]:
-        """The schemas of its agents, by their names in Hydra's group `agent/schema`."""
-
-    def check(self, config: TrainConfig) -> None:
-        """Check a run's settings; InputError: the first one that could not train as it says."""
-
-    def import_for(self, config: AgentConfig) -> None:
-        """Import what training takes; settings that cannot work are left for the run to refuse."""
-
-    def on_processor(self, device: str) -> bool:
-        """Whether a run with this `device` computes on the processor, not on a GPU."""
-
-    def build(self, config: AgentConfig, context: TrainingContext) -> Agent:
-        """Build an agent; InputError: a setting that only the algorithm's library can judge."""
-
-    def weights(self, path: Path, most: int) -> dict[str, NDArray[Any]]:
-        """The arrays of a model file by name; InputError: it has more than `most` bytes, or is damaged."""
-
-
-def family(config: AgentConfig) -> Family:
-    """Import the family of an agent's settings."""
-    known = sorted(module.name for module in pkgutil.iter_modules(__path__))
-    if config.family not in known:
-        raise InputError(
-            f"agent.family={config.family}: there is no such family; there are {', '.join(known)}"
-        )
-    for key in ("family", "algorithm"):
-        given, own = getattr(config, key), getattr(type(config), key)
-        if own not in (given, MISSING):
-            raise InputError(f"agent.{key}={given}: these are the settings of {own}; choose agent=...")
-    return cast("Family", importlib.import_module(f"gridworld.agents.{config.family}"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import dataclasses
 import signal
@@ -10,9 +11,10 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from functools import cached_property
+from html import escape
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,17 +25,27 @@ from gridworld.config.compose import compose as compose_words
 from gridworld.config.train import TrainConfig
 from gridworld.diagnosis import verdict
 from gridworld.diagnosis.evidence import Evidence
+from gridworld.envs.rendering import Frame
 from gridworld.errors import InputError, failure
 from gridworld.process.signals import Interrupted
 from gridworld.process.user_input import limited
 from gridworld.report.evidence import read_columns
 from gridworld.restore.resume import unfinished_of
 from gridworld.restore.saved_run import SavedRun, read_visits
+from gridworld.run import summary as run_summary
 from gridworld.run.folder import claimed
 from gridworld.run.reader import check_free, is_started
 from gridworld.training.setup import without_pictures
 from gridworld.training.train import train as train_in
+from gridworld.visualization.files import encode_png
+from gridworld.visualization.picture import Subject, drawer
 from gridworld.world.evaluation import Evaluator
+
+if TYPE_CHECKING:  # of most runs nothing is drawn
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+    from gridworld.report.chart import Chart
 
 Curve = dict[str, NDArray[Any]]
 
@@ -42,7 +54,7 @@ _KINDS: dict[str, type] = {"step": np.int64, "certified": np.bool_, "sampled_cer
 
 
 class RunResult:
-    """A finished run: what `train` returns, and `open_run` reads from a folder.
+    """A finished run: what `train` returns, and `open_run` reads from a folder. A notebook shows it.
 
     Attributes:
         config: every setting of the run.
@@ -96,6 +108,40 @@ class RunResult:
     def agent(self) -> Agent:
         """The trained agent, which has the model."""
         return self._make_agent()
+
+    def plot(self, metric: str = "value") -> Figure:
+        """Draw the exact learning curve of both policies next to the optimum, as a figure of matplotlib.
+
+        Args:
+            metric: one that `curve` has of both: "value", "regret", "return", "length", "certified", ...
+
+        Raises:
+            InputError: there is no such metric.
+        """
+        return self._chart(metric).figure
+
+    def _chart(self, metric: str) -> Chart:
+        from gridworld.report.agent_charts import run_chart  # here, with matplotlib
+
+        return run_chart(metric, self.curve, self.evaluator, self.summary)
+
+    def policy_map(self, cell_size: int | None = None) -> Image.Image:
+        """Draw its values and greedy actions, as in `policy.png`, as a picture of Pillow; cells in pixels."""
+        from PIL import Image
+
+        shown = self.config, False, self.evaluator, self.policy, self.summary["timesteps"], self.visits
+        return Image.fromarray(cast(Frame, drawer("maps.policy")(Subject(*shown))(cell_size)))
+
+    def _repr_html_(self) -> str:
+        """Its verdict, learning curve and policy."""
+        pictures = [self._chart("value").saved_as("png")]
+        with contextlib.suppress(InputError):  # the world is too large for a map
+            pictures.append(encode_png(np.asarray(self.policy_map())))
+        sources = (f"data:image/png;base64,{base64.b64encode(each).decode()}" for each in pictures)
+        images = "".join(f'<img src="{each}" style="max-width:100%;max-height:340px"> ' for each in sources)
+        why = "" if self.summary["certified"] else "; gridworld.diagnose(run) says why"
+        sentence = escape(run_summary.verdict(self.summary))
+        return f"<p>{escape(repr(self))}<br><b>{sentence}</b>{why}</p>{images}"
 
     def __repr__(self) -> str:
         summary = self.summary
@@ -254,7 +300,7 @@ def _as_python_interrupts(is_kept: bool) -> Iterator[None]:
     try:
         yield
     except Interrupted as interruption:
-        how = "; the same call goes on where it was saved" if is_kept else ""
+        how = "; make the same call to resume" if is_kept else ""
         if interruption.exit_code == 128 + signal.SIGINT:
             raise KeyboardInterrupt(f"{interruption}{how}") from None
         raise SystemExit(interruption.exit_code) from None

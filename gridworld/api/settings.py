@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ Override = str | Mapping[str, Any]
 
 _KEY = re.compile(r"[+~]*[A-Za-z_][\w./@]*")
 _OF_THE_COMMAND = re.compile(r"[+~]*hydra(?!\.searchpath=)[./@=]|resume=")
+_FOLDER = re.compile(r"[+~]*(hydra\.(run|sweep)\.dir|tune\.folder|resume)=")
 
 
 def compose(*overrides: Override, **settings: Any) -> TrainConfig:
@@ -47,34 +48,43 @@ def compose(*overrides: Override, **settings: Any) -> TrainConfig:
 
 def words(*overrides: Override, **settings: Any) -> list[str]:
     """The words of the command line that say the same as these arguments of `compose`."""
+    found = with_recipe(command_words(overrides, settings))
+    with contextlib.suppress(HydraException):  # which composing raises again
+        for parsed in OverridesParser.create().parse_overrides(found):
+            if parsed.is_sweep_override():
+                raise InputError(f"{parsed.input_line}: has several values; call gridworld.sweep with them")
+    return found
+
+
+def command_words(
+    overrides: Sequence[Override], settings: Mapping[str, Any], of_many: bool = False
+) -> list[str]:
+    """Overrides and settings as words of a command line; `of_many` runs, where a list is several values."""
     found: list[str] = []
     for override in (*overrides, settings):
         if isinstance(override, Mapping):
             for key, value in flat(override):
                 if not _KEY.fullmatch(key):
                     raise InputError(f"{key!r:.80}: must be the name of a setting, such as 'agent.gamma'")
-                found.append(_checked(f"{key}={literal(_plain(value), key)}"))
+                plain = _plain(value)
+                several = isinstance(value, range) or (of_many and isinstance(plain, list))
+                texts = [literal(each, key) for each in (plain if several else [plain])]
+                found.append(f"{key}={','.join(texts)}")
         elif isinstance(override, str):
-            found.append(_checked(override))
+            found.append(override)
         else:
             raise InputError(
                 f"{override!r:.80}: must be an override, such as 'agent=dqn', or a dictionary of settings, "
                 "such as {'agent.gamma': 0.9}"
             )
-    found = with_recipe(found)
-    with contextlib.suppress(HydraException):  # which composing raises again
-        for parsed in OverridesParser.create().parse_overrides(found):
-            if parsed.is_sweep_override():
-                raise InputError(f"{parsed.input_line}: has several values; call train once for each")
+    for word in found:
+        if word.startswith("-") or (not word.startswith("~") and "=" not in word):
+            raise InputError(
+                f"{word}: is not an override; write KEY=VALUE, for instance 'agent=dqn' or 'seed=3'"
+            )
+        if (_FOLDER if of_many else _OF_THE_COMMAND).match(word):
+            raise InputError(f"{word}: belongs to the command line; here the folder is given by folder=...")
     return found
-
-
-def _checked(word: str) -> str:
-    if word.startswith("-") or (not word.startswith("~") and "=" not in word):
-        raise InputError(f"{word}: is not an override; write KEY=VALUE, for instance 'agent=dqn' or 'seed=3'")
-    if _OF_THE_COMMAND.match(word):
-        raise InputError(f"{word}: belongs to the command line; here the run's folder is given by folder=...")
-    return word
 
 
 def _plain(value: Any) -> Any:
@@ -83,6 +93,6 @@ def _plain(value: Any) -> Any:
         return os.fspath(value)
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
-    if isinstance(value, tuple | list):
+    if isinstance(value, tuple | list | range):
         return [_plain(each) for each in value]
     return value

@@ -64,11 +64,11 @@ def evaluate(
         0.049
     """
     if (model_or_table is None) == (q is None):
-        raise InputError("evaluate: give one of a model or table, as the first argument, and q=...")
+        raise InputError("evaluate: give either a model or table as the first argument, or q=...")
     is_model = hasattr(model_or_table, "observation_space")
     place = model_or_table.get_env() if env is None and hasattr(model_or_table, "get_env") else env
     if place is None:
-        raise InputError("env: is needed; give an environment, a compiled world or the name of a world")
+        raise InputError("env: is required; give an environment, a compiled world or the name of a world")
     if isinstance(place, str):
         place = named_world(place)
     elif isinstance(evaluator := getattr(place, "evaluator", None), Evaluator):  # a run
@@ -84,8 +84,8 @@ def evaluate(
         tables = ForeignPolicy(model_or_table, task).tables()
         if tables.sampled is None and not deterministic:
             raise InputError(
-                f"{type(model_or_table).__name__}: has its own predict(), so the distribution that it "
-                "explores with is not known; take deterministic=True"
+                f"{type(model_or_table).__name__}: has its own predict(), so its exploring distribution is "
+                "unknown; use deterministic=True"
             )
         policy = tables.greedy if deterministic or tables.sampled is None else tables.sampled
     else:
@@ -102,7 +102,7 @@ def _policy(task: Task, table: Any, is_q: bool) -> FloatArray:
         kind = type(table).__name__
         raise InputError(f"{name}: {kind} is neither a model nor a table of numbers") from None
     if np.isnan(numbers).any():
-        raise InputError(f"{name}: has NaN")
+        raise InputError(f"{name}: contains NaN")
     numbers, size = _by_states(task, numbers), mdp.num_states
     if numbers.shape == (size,) and not is_q:
         wrong = ~np.isin(numbers, np.arange(mdp.num_actions))
@@ -121,9 +121,7 @@ def _policy(task: Task, table: Any, is_q: bool) -> FloatArray:
     if is_q:
         return one_hot_policy(numbers.argmax(axis=1), mdp.num_actions)
     if (numbers < 0).any() or (np.abs(numbers.sum(axis=1) - 1) > 1e-4).any():
-        raise InputError(
-            f"{name}: its rows are not probabilities, at least 0 with sum 1; give Q values as q=..."
-        )
+        raise InputError(f"{name}: its rows are not probability distributions; give Q values as q=...")
     return numbers
 
 
@@ -187,6 +185,6 @@ def make_vec(mdp: Mdp, num_envs: int = 1, **kwargs: Any) -> GridWorldVectorEnv:
         >>> states, rewards, terminated, truncated, infos = env.step(env.action_space.sample())
     """
     if not isinstance(mdp, Mdp):
-        raise InputError(f"mdp={str(mdp)[:50]}: must be a compiled world, as `compile_env` makes one")
+        raise InputError(f"mdp={str(mdp)[:50]}: must be a compiled world, as from `compile_env`")
     kwargs.setdefault("max_episode_steps", mdp.default_step_limit)
     return GridWorldVectorEnv(num_envs, mdp=mdp, **kwargs)

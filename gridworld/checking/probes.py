@@ -165,7 +165,7 @@ def acts_as_learnt(trained: Trained) -> str:
         return "takes no steps"
     share = float(trained.late[best].sum()) / steps
     if share < LEAST_BEST:
-        raise UnmetError(f"{share:.0%} of its last actions are best ones, must be {LEAST_BEST:.0%}")
+        raise UnmetError(f"{share:.0%} of its last actions are optimal, must be {LEAST_BEST:.0%}")
     return f"{share:.0%} of its last actions are best ones"
 
 
@@ -243,48 +243,48 @@ _NO_EXPLORATION_LEFT = {"exploration_final_eps": 0.0}
 # fmt: off
 PROBES = (
     Probe("constant", CONSTANT, values,
-          "the value is not learnt at all: its loss, its optimiser or the reward that reaches it"),
+          "values are not learnt at all: check the loss, the optimiser and the reward that reaches it"),
     Probe("discount", CORRIDOR, values,
-          "gamma is ignored or applied at the wrong step, or a reward belongs to another step",
+          "gamma is ignored or applied at the wrong step, or a reward is credited to another step",
           gamma=0.5),
     Probe("choice", BANDIT, optimal,
-          "worse actions are preferred: the sign of the advantage, or rewards assigned to the wrong actions"),
+          "worse actions are preferred: the advantage's sign is wrong, or rewards go to the wrong actions"),
     Probe("context", TWO_CONTEXTS, optimal,
-          "the policy does not depend on the state: observations are lost, mixed up or of another step",
+          "the policy does not depend on the state: observations are lost, mixed up or from another step",
           arguments=_NO_EXPLORATION_LEFT),
     Probe("behaviour", TWO_CONTEXTS, acts_as_learnt,
-          "it acts otherwise than it has learnt: exploration does not end, or ends late, or it sees another "
-          "observation when it acts than when it learns",
+          "it does not act as it has learnt: exploration ends late or never, or acting and learning see "
+          "different observations",
           arguments=_NO_EXPLORATION_LEFT),
     Probe("layers", TWO_CONTEXTS, all_layers_learn,
-          "a layer never changes: it is not in the optimiser, cut off from the gradient or never copied",
+          "a layer never changes: the optimiser lacks it, it gets no gradient or it is never copied",
           arguments=_NO_EXPLORATION_LEFT),
     Probe("exploration", TWO_CONTEXTS, acts_at_random,
-          "it explores less than its epsilon says: that is ignored, scaled or starts elsewhere",
+          "it explores less than its epsilon says: epsilon is ignored, scaled or starts elsewhere",
           arguments={"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0},
           needs="exploration_final_eps"),
     Probe("entropy", DEAR_CONTEXTS, soft_optimal,
-          "the entropy bonus is not what its coefficient says: its sign or scale is wrong, it is missing, or "
-          "it is not that of each state's policy",
+          "the entropy bonus does not match its coefficient: wrong sign or scale, missing, or not of each "
+          "state's policy",
           arguments={"ent_coef": BONUS}, needs="ent_coef"),
     Probe("delay", DELAY, optimal_with_values,
-          "credit does not reach earlier steps: returns, traces or next observations are of the wrong step"),
+          "credit does not reach earlier steps: returns, traces or next observations are off by a step"),
     Probe("termination", END_LIKE_THE_START, values,
-          "values are taken from beyond the end of an episode: the terminal flag is ignored"),
+          "values are bootstrapped past the end of an episode: the terminal flag is ignored"),
     Probe("truncation", ENDLESS, values,
-          "a step limit is treated as an end: the value of the state where it was cut is missing",
+          "a step limit is treated as termination: the value of the last state is missing",
           gamma=0.8),
     Probe("stochastic", GAMBLE, optimal_with_values,
-          "it does not learn the mean of a random reward, but its extreme, its median or its last draw"),
+          "it does not learn the mean of a random reward, but an extreme, its median or its last draw"),
     Probe("alternation", ALTERNATION, optimal_with_values,
           "the value of the next state is wrong: another state's, or not that of its best action",
           gamma=0.8),
     Probe("trap", TRAP, optimal_with_values,
-          "the next reward counts for more than the return: what follows is not added, or costs are lost"),
+          "the next reward counts for more than the return: later rewards are not added, or costs are lost"),
     Probe("slip", SLIPPERY, optimal_with_values,
-          "uncertain moves are not averaged over, or next states are not where the world went"),
+          "random transitions are not averaged over, or next states are wrong"),
     Probe("target", ENDLESS, first_backup,
-          "targets are not computed with the target network: it never had an update, the values moved on",
+          "targets are not computed with the target network: it is never updated, or lags behind",
           gamma=0.8, arguments={"target_update_interval": 10_000_000}, needs="target_update_interval"),
 )
 # fmt: on

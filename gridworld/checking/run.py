@@ -110,7 +110,7 @@ def check(
     known = [probe.name for probe in PROBES]
     for name in probes:
         if name not in known:
-            raise InputError(f"--probe {name}: there is no such probe; there are {', '.join(known)}")
+            raise InputError(f"--probe {name}: no such probe; choose from {', '.join(known)}")
     chosen = [probe for probe in PROBES if not probes or probe.name in probes]
     groups = [list(group) for _, group in itertools.groupby(chosen, lambda probe: probe.training)]
     if (first := settings(config, chosen[0], given)) is not None:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import Agent, TrainingContext, family
+from gridworld.agents import Agent, TrainingContext
 from gridworld.agents.sb3.settings import SB3ClassConfig, SB3Config
 from gridworld.checking.probes import Probe, Trained
 from gridworld.config.train import AgentConfig
@@ -28,7 +28,7 @@ from gridworld.world.chain import one_hot_policy
 from gridworld.world.mdp import Mdp
 
 _LAST = 0.6  # of training; what it does after that is its behaviour
-_OURS = {"gamma": "each probe has its own", "seed": "see --seed", "device": "it is cpu"}
+_OURS = {"gamma": "each probe sets its own", "seed": "see --seed", "device": "it is always cpu"}
 _FEW_QUANTILES = {"n_quantiles": 25}  # of a policy that has them; 200 take ten times as long
 
 
@@ -149,7 +149,7 @@ def build(config: AgentConfig, mdp: Mdp, num_envs: int, seed: int) -> tuple[Agen
     kind = "none" if config.family == "tabular" else "one_hot"
     envs = StatisticsVectorEnv(num_envs, mdp=mdp, max_episode_steps=mdp.max_episode_steps)
     context = TrainingContext(envs, make_observation(mdp, kind), seed, "cpu")
-    return family(config).build(config, context), context
+    return config.build(context), context
 
 
 def train(config: AgentConfig, mdp: Mdp, gamma: float, num_envs: int, steps: int, seed: int) -> Trained:

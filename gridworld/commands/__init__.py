@@ -15,24 +15,24 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.bounds import Bounds, digits
-from gridworld.errors import EXIT_CODE, InputError, failure
+from gridworld.errors import DISTRIBUTION, EXIT_CODE, InputError, failure
 from gridworld.process.console import CONSOLE, prepare, printing, program, tell_error
 from gridworld.process.signals import Interrupted, at_work
 
 # By name, in the order of the manual: what it does.
 COMMANDS = {
     "train": "train an agent, resume a run, or run a sweep",
-    "jobs": "show how the jobs of a sweep stand",
+    "jobs": "show the status of a sweep's jobs",
     "evaluate": "score a finished run again, exactly and by sampling",
-    "diagnose": "say why a finished run is not optimal, and what to try",
-    "record": "export a finished run's episodes and pictures",
-    "report": "put many runs side by side, as one page",
-    "export": "hand finished runs to W&B, MLflow or the Hugging Face Hub",
-    "reproduce": "run a run again and compare bit for bit",
-    "tune": "search an agent's settings for a task, and confirm the winner",
+    "diagnose": "explain why a finished run is not optimal, and what to try",
+    "record": "draw a finished run's episodes and maps",
+    "report": "compare many runs on one page",
+    "export": "export finished runs to W&B, MLflow or the Hugging Face Hub",
+    "reproduce": "repeat a finished run and compare it bit for bit",
+    "tune": "tune an agent's settings for a task, and confirm the winner",
     "check": "check an algorithm's implementation on worlds with known answers",
-    "play": "play a world with the arrow keys, with a trained agent next to you if you like",
-    "benchmark": "measure the speed of this project and of its peers",
+    "play": "play a world yourself, next to a trained agent if you like",
+    "benchmark": "measure the speed of this project and its peers",
 }
 _MANUAL = """\
 A Stable-Baselines3 experiment harness whose ground truth is known.
@@ -42,17 +42,17 @@ usage: {console} COMMAND ...
 Commands:
 {commands}
 
-What a command takes: {console} COMMAND --help
-The version: {console} --version
+Help for a command: {console} COMMAND --help
+Version: {console} --version
 
 Examples:
   {console} train agent=dqn
   {console} evaluate runs/...
   {console} train -m agent=dqn,ppo "seed=range(20)" hydra.sweep.dir=runs/mine
   {console} report runs/mine"""
-_BEST = "the model with the lowest exact regret on the way, not the last one"
-_TRUST = "import the classes that the run names, wherever they are from, and let its environment draw"
-_POLICY = "the best action, or the distribution it explores with"
+_BEST = "use the model with the lowest exact regret, not the last one"
+_TRUST = "import the classes that the run names, from any package, and let its environment draw"
+_POLICY = "the best action, or the distribution that it explores with"
 _SHARED: dict[str, dict[str, Any]] = {  # arguments that several commands have
     "run": {"type": Path, "help": "the run's folder, e.g. runs/2026-..."},
     "runs": {"type": Path, "nargs": "+", "metavar": "RUNS", "help": "folders, searched for runs"},
@@ -134,12 +134,12 @@ def _without_command(words: Sequence[str]) -> None:
         print(_MANUAL.format(console=CONSOLE, commands=commands))
         return
     if word == "--version":
-        from gridworld import __version__
+        from importlib.metadata import version
 
-        print(f"{CONSOLE} {__version__}")
+        print(f"{CONSOLE} {version(DISTRIBUTION)}")
         return
     close = difflib.get_close_matches(word.removesuffix(".py"), COMMANDS, n=1)
     advice = f"did you mean {CONSOLE} {close[0]}?" if close else f"it is one of {', '.join(COMMANDS)}"
     if not close and "=" in word:
-        advice = f"settings stand after a command: {CONSOLE} train {word}"
-    raise InputError(f"{CONSOLE}: there is no command {word}; {advice}")
+        advice = f"settings come after a command: {CONSOLE} train {word}"
+    raise InputError(f"{CONSOLE}: unknown command {word}; {advice}")

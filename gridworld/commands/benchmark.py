@@ -1,4 +1,4 @@
-"""Measure how fast this is beside named peers, in turn in the same run; only ratios are worth quoting."""
+"""Measure the speed of this project and its peers in turn, in one run; only the ratios are comparable."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def main(arguments: Sequence[str]) -> None:
     options = _parser().parse_args(arguments)
     check_inside(options.out, "--out")
     if not options.out.parent.is_dir():
-        raise InputError(f"--out {options.out}: there is no folder {options.out.parent}")
+        raise InputError(f"--out {options.out}: no such folder {options.out.parent}")
     if options.out.is_dir():
         raise InputError(f"--out {options.out}: is a folder; name a file in it")
     check_writable(options.out.parent, "--out")
     if not (_DOCS / "benchmarks").is_dir():
-        raise InputError(f"{program('benchmark')}: what it measures is in docs/benchmarks of the source")
+        raise InputError(f"{program('benchmark')}: needs docs/benchmarks of a source checkout")
     sys.path.insert(0, str(_DOCS))
     measure = import_module("benchmarks.measure")
     workload = measure.QUICK if options.quick else measure.FULL
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("benchmark", __doc__)
     option = parser.add_argument
-    option("--quick", action="store_true", help="minutes: one short repetition of everything")
-    option("--only", choices=list(_TABLES), nargs="+", default=list(_TABLES), help="some of the tables")
-    option("--out", type=Path, default=Path("runs/benchmark.json"), help="where the JSON goes")
+    option("--quick", action="store_true", help="one short repetition of everything, which takes minutes")
+    option("--only", choices=list(_TABLES), nargs="+", default=list(_TABLES), help="only these tables")
+    option("--out", type=Path, default=Path("runs/benchmark.json"), help="the JSON file to write")
     return parser

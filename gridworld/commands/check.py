@@ -1,7 +1,7 @@
 """Check an implementation of an algorithm on small worlds with known answers.
 
-It trains on each world for seconds. What it has learnt is compared with the exact values and the optimal
-actions. The exit code is 0 if everything holds, 1 if not, 2 for a mistake on the command line.
+The algorithm trains on each world for a few seconds; its values and actions are compared with the exact ones.
+Exit code: 0 if all probes pass, 1 if not, 2 for a mistake on the command line.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ def _parser() -> argparse.ArgumentParser:
         textwrap.fill(f"  {probe.name:<13}{probe.meaning}", 100, subsequent_indent=" " * 15)
         for probe in PROBES
     )
-    epilog = f"The probes, and what it means where one fails:\n{probes}"
+    epilog = f"The probes, and what a failure means:\n{probes}"
     parser = parser_of("check", __doc__, epilog=epilog)
     option = parser.add_argument
-    option("algorithm", help="a class of SB3's kind, e.g. my_package.MyPPO; or a shipped agent, e.g. dqn")
+    option("algorithm", help="a class like SB3's, e.g. my_package.MyPPO, or a shipped agent, e.g. dqn")
     argument = "an argument for the class, e.g. learning_rate=0.001; may be repeated"
     option("--set", action="append", default=[], metavar="NAME=VALUE", help=argument)
     option("--probe", action="append", default=[], metavar="NAME", help="only this probe; may be repeated")
-    option("--seed", type=whole(0), default=0, help="the first of the three that a probe may take")
+    option("--seed", type=whole(0), default=0, help="the first of up to three seeds (default 0)")
     processes = min(_PROCESSES, os.cpu_count() or 1)
-    option("--processes", type=whole(1), default=processes, help="how many train at a time")
+    option("--processes", type=whole(1), default=processes, help="how many runs train at a time")
     return parser

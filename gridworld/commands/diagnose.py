@@ -1,4 +1,4 @@
-"""Say why a finished run is not optimal: where its regret comes from, what causes it, and what to try."""
+"""Explain why a finished run is not optimal: where its regret comes from, its cause, and what to try."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _is_any_certified(saved: SavedRun, found: Diagnosis, options: argparse.Names
 
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("diagnose", __doc__, "run", "--trust")
-    tried = "train what there is to try, in RUN-tried, until one is certified; exit code 1 if none is"
+    tried = "train the suggestions, in RUN-tried, until one is certified; exit code 1 if none is"
     parser.add_argument("--try", dest="try_offers", action="store_true", help=tried)
     return parser
 

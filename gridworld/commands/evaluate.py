@@ -45,7 +45,7 @@ def main(arguments: Sequence[str]) -> None:
             names = [evaluator.mdp.state_name(state) for state in states[:MOST_NAMED]]
             circles = circles_text(len(states), names, score.outcome.timeout)
             verdict = f"not optimal: regret {score.regret:.3g}{circles}"
-    of = f"{options.run} at its best, step {saved.steps():,}," if options.best else options.run
+    of = f"{options.run} (best model, step {saved.steps():,})" if options.best else options.run
     print(printable(f"{options.policy} policy of {of} on {evaluator.mdp.name}"))
     print(table)
     print(f"  {verdict}")
@@ -54,12 +54,12 @@ def main(arguments: Sequence[str]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("evaluate", __doc__, "run", "--policy", "--best", "--trust")
     option = parser.add_argument
-    option("--layout", help="score it on another map of the same size: a name or a file")
+    option("--layout", help="score on another map of the same size: a name or a file")
     option(
         "--episodes", type=whole(1, _MOST_EPISODES), default=1000, help="episodes to sample (default 1000)"
     )
-    option("--seed", type=whole(0), default=0, help="of the sampled episodes (default 0)")
-    option("--render", choices=("human",), help="first show one episode in a window")
+    option("--seed", type=whole(0), default=0, help="seed of the sampled episodes (default 0)")
+    option("--render", choices=("human",), help="show one episode in a window first")
     return parser
 
 

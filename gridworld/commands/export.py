@@ -1,8 +1,8 @@
-"""Hand finished runs to other programs: Weights & Biases, MLflow, or a folder for the Hugging Face Hub.
+"""Export finished runs to Weights & Biases, MLflow, or a folder for the Hugging Face Hub.
 
-RUNS are folders of runs, of sweeps, or any above them. Nothing is uploaded: W&B writes an offline run unless
-WANDB_MODE says otherwise, MLflow a local database unless MLFLOW_TRACKING_URI does. A run that is there
-already is not written again. The exit code is 0 if every run found is exported, 1 if some are not, 2 if none.
+RUNS are folders of runs or sweeps, or any above them. Nothing is uploaded by default: W&B writes offline runs
+(unless WANDB_MODE is set), MLflow a local database (unless MLFLOW_TRACKING_URI is set). Runs exported before
+are skipped. Exit code: 0 if every run is exported, 1 if some are not, 2 if none is.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _export(folder: Path, to: str, out: Path, project: str) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("export", __doc__, "runs")
     option = parser.add_argument
-    option("--to", choices=tuple(TARGETS), required=True, help="all but hub need the extra of that name")
-    option("--out", type=Path, help="the folder to write to (default: runs/export/ and the target)")
+    option("--to", choices=tuple(TARGETS), required=True, help="all but hub need the extra of the same name")
+    option("--out", type=Path, help="the folder to write to (default runs/export/TARGET)")
     option("--project", default="gridworld", help="W&B's project, MLflow's experiment (default: gridworld)")
     return parser

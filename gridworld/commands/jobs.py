@@ -1,4 +1,4 @@
-"""Show how the jobs of a sweep stand, and put its jobs.csv right: after a kill, say."""
+"""Show the status of a sweep's jobs, and update its jobs.csv, which a kill may have left behind."""
 
 from __future__ import annotations
 
@@ -39,5 +39,5 @@ def _cells(row: JobRow) -> list[str]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=program("jobs"), description=__doc__)
     parser.add_argument("sweep", type=Path, help="the sweep's folder, e.g. runs/mine")
-    parser.add_argument("--status", choices=STATUSES, help="only the jobs that stand like this")
+    parser.add_argument("--status", choices=STATUSES, help="only jobs with this status")
     return parser

@@ -20,46 +20,47 @@ usage: python scripts/train.py [-m] [recipe=FILE] [group=choice ...] [key=value 
 Choices:
 {choices}
 
-Keys, with their values: python scripts/train.py --cfg job
-  seed, total_timesteps, n_envs, device, threads  the run itself
-  exploration_bonus  what training pays for actions that were rarely taken; 0 for nothing
-  agent.*, env.*, observation.*      what learns, in which world, and what it sees
-  evaluation.*, logging.*, recording.*, checkpoint.*  what is computed and kept on the way
-  hydra.run.dir  the folder to write to, instead of a new one in runs/
+Keys (all of them, with their values: python scripts/train.py --cfg job):
+  seed, total_timesteps, n_envs, device, threads      the run itself
+  agent.*, env.*, observation.*                       the agent, its world, and what it observes
+  exploration_bonus                                   extra reward in training for rarely taken actions
+  evaluation.*, logging.*, recording.*, checkpoint.*  what is computed and saved during training
+  hydra.run.dir                                       the run's folder, instead of a new one in runs/
 
-An interrupted run is resumed with resume=RUN, or when the same command meets its folder, and ends as if
-nothing had happened. With resume=RUN beside it:
-  total_timesteps=N       make the run longer, a finished one too
-  trust=true              import classes that are neither ours nor one of the libraries'
-  anyway=true             with other versions or another processor: the last bits may differ
+Resume an interrupted run with resume=RUN, or by running the same command with the same folder; it ends as if
+it had never been interrupted. Options of resume=RUN:
+  total_timesteps=N       make the run longer, even a finished one
+  trust=true              import classes from any package
+  anyway=true             resume with other versions or on another processor; the last bits may differ
 
-An agent in a world for which it was tuned brings the recipe in by itself, below what the command line says;
-tuned=none leaves it out, and preset=none the settings for stochastic and for large worlds.
+Agents that were tuned for a world use the recipe automatically; the command line overrides it. tuned=none
+leaves recipes out, preset=none the settings for stochastic and for large worlds.
 
-What tune.py found, recipe=FILE (the study's folder, or the yaml in it), is read as data, whoever made it, and
-what stands beside it goes before it; trust=true as above. --config-dir FOLDER is for yaml files of your own:
-Hydra reads them, and they can have it run code.
+recipe=FILE uses what tune.py found: a study's folder, or the yaml file in it. It is read as data, so recipes
+from strangers are safe; the command line overrides them. --config-dir FOLDER adds your own yaml files; Hydra
+reads them, and they can run code.
 
 Sweeps (-m):
-  hydra.sweep.dir        the folder to write to; with the same one again, the sweep is resumed
-  hydra/launcher=basic   one job at a time, in this process; else as many as there are cores, in forks of it
-  hydra/launcher=joblib  the same in processes of their own; slurm and ray: on a cluster
-  hydra.sweeper.paired=[agent,n_envs]  these lists vary together, not in every combination
+  hydra.sweep.dir        the sweep's folder; the same folder again resumes the sweep
+  hydra/launcher=forks   the default: as many jobs at a time as there are cores, in forks of this process
+  hydra/launcher=basic   one job at a time, in this process
+  hydra/launcher=joblib  parallel jobs in new processes; on a cluster: slurm, ray
+  hydra.sweeper.paired=[agent,n_envs]  these lists vary together instead of in every combination
 
 Examples:
   python scripts/train.py agent=q_learning
-      a table over the states, trained within a second
+      a table over the states, trained in a second
   python scripts/train.py agent=dqn env=four_rooms seed=3
-      another world, with the recipe that was tuned for it; its folder in runs/ has the results
+      another world, with the recipe tuned for it; its folder in runs/ has the results
   python scripts/train.py -m agent=dqn,ppo "seed=range(20)" hydra.sweep.dir=runs/mine
-      a sweep of forty runs, a folder each; look at them with tensorboard --logdir runs/mine
+      a sweep of forty runs in a folder each; see them with tensorboard --logdir runs/mine
   python scripts/train.py resume=runs/mine
-      resume a run that was interrupted
+      resume an interrupted run
   python scripts/train.py recipe=runs/tune_ppo_maze seed=3
-      the winner of a study
+      train with the winner of a study
 
-Afterwards: scripts/evaluate.py, scripts/record.py and scripts/play.py --agent, with a run's folder;
-scripts/jobs.py, with a sweep's. Before: scripts/tune.py finds settings.
+Next: scripts/evaluate.py, scripts/record.py and scripts/play.py --agent take a run's folder, scripts/jobs.py
+a sweep's. To find settings: scripts/tune.py.
 Hydra's own options: python scripts/train.py --hydra-help
 """
 

@@ -1,19 +1,16 @@
-"""Draw a finished run: its episodes as numbered PNGs, GIF, APNG or MP4, and maps of what it learnt."""
+"""Draw a finished run: episodes as numbered PNGs, GIF, APNG or MP4, and maps of what it learnt."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
 
 from gridworld.commands import parser_of, whole
 from gridworld.config.train import PICTURES
 from gridworld.envs.rendering import frame_size
 from gridworld.envs.rollout import play
+from gridworld.errors import InputError
 from gridworld.process.console import printable, telling_if_slow
 from gridworld.process.user_input import limited
 from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
@@ -21,8 +18,7 @@ from gridworld.run.folder import check_inside, check_writable
 from gridworld.storage.safe_read import check_no_link
 from gridworld.visualization import files
 from gridworld.visualization.episode import film
-from gridworld.visualization.picture import drawer
-from gridworld.world.evaluation import Evaluator
+from gridworld.visualization.picture import Subject, drawer
 
 MAPS = {picture.name: picture.drawer for picture in PICTURES if picture.is_map}
 
@@ -39,29 +35,6 @@ def main(arguments: Sequence[str]) -> None:
         _record(options)
 
 
-class _SavedSubject:
-    """See `visualization.picture.Subject`; a file of the run is read when it is asked for."""
-
-    history = None
-
-    def __init__(self, saved: SavedRun, is_trusted: bool) -> None:
-        self._saved, self.is_trusted = saved, is_trusted
-        self.config = saved.config
-        self.snapshot = saved.snapshot()
-
-    @cached_property
-    def evaluator(self) -> Evaluator:
-        return self._saved.evaluator()
-
-    @cached_property
-    def steps(self) -> int:
-        return self._saved.steps()
-
-    @cached_property
-    def visits(self) -> NDArray[np.int64]:
-        return read_visits(self._saved.run, self._saved.mdp.probability.shape[:2])
-
-
 def _record(options: argparse.Namespace) -> None:
     folder: Path = options.out or options.run / "recording"
     saved = SavedRun(options.run, options.trust, options.best)
@@ -70,9 +43,15 @@ def _record(options: argparse.Namespace) -> None:
     if options.cell_size is not None:
         frame_size(saved.mdp, options.cell_size)
     formats = list(dict.fromkeys(options.format))
-    subject, mdp = _SavedSubject(saved, options.trust), saved.mdp
+    evaluator, mdp, visits = saved.evaluator(), saved.mdp, None
+    try:
+        visits = read_visits(saved.run, mdp.probability.shape[:2])
+    except InputError:  # the other pictures can be drawn without
+        if "visits" in formats:
+            raise
+    subject = Subject(saved.config, options.trust, evaluator, saved.snapshot(), saved.steps(), visits)
     drawn = {kind: drawer(MAPS[kind])(subject)(options.cell_size) for kind in formats if kind in MAPS}
-    policy, limit = choose_policy(subject.snapshot, options.policy), subject.evaluator.max_episode_steps
+    policy, limit = choose_policy(subject.snapshot, options.policy), evaluator.max_episode_steps
     episodes = [play(mdp, policy, limit, options.seed + index) for index in range(options.episodes)]
     animation = film(saved.config.env, mdp, episodes, options.trust)(options.cell_size)
     files.check_size(animation, formats)
@@ -92,8 +71,8 @@ def _parser() -> argparse.ArgumentParser:
     kinds += " (default png gif; mp4 needs the extra `video`)"
     option("--format", nargs="+", choices=(*files.FORMATS, *MAPS), default=["png", "gif"], help=kinds)
     option("--cell-size", type=whole(2), help="pixels (default 100, 80 in maps, less on large worlds)")
-    option("--fps", type=whole(1, 100), default=4, help="frames a second, 1 to 100 (default 4)")
-    option("--episodes", type=whole(1, 1000), default=1, help="one after the other (default 1)")
-    option("--seed", type=whole(0), default=0, help="of the first episode (default 0)")
+    option("--fps", type=whole(1, 100), default=4, help="frames per second, 1 to 100 (default 4)")
+    option("--episodes", type=whole(1, 1000), default=1, help="number of episodes (default 1)")
+    option("--seed", type=whole(0), default=0, help="seed of the first episode (default 0)")
     option("--out", type=Path, help="the folder to write to (default RUN/recording)")
     return parser

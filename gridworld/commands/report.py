@@ -1,23 +1,26 @@
-"""Put many runs side by side: statistics over seeds with intervals, curves and tables, as one page.
+"""Compare many runs on one page: statistics over seeds with intervals, curves and tables.
 
-RUNS are folders of runs, of sweeps, or any above them. The exit code is 0 if every run found is counted and
-whole, 1 if the report was written but names something to look into (a run that is unfinished or contradicts
-another, a damaged file), 2 if there was nothing to report.
+RUNS are folders of runs or sweeps, or any above them. Exit code: 0 if every run is complete and counted, 1 if
+the report has warnings (an unfinished run, two contradictory runs, a damaged file), 2 if there is nothing to
+report.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from gridworld.commands import parser_of, whole
+from gridworld.errors import InputError
 from gridworld.process.console import printable, telling_if_slow
 from gridworld.process.user_input import limited
-from gridworld.report.analysis import MOST_SHOWN, Reason, gather, reasons
+from gridworld.report.analysis import MOST_SHOWN, Reason, Reasons, gather
+from gridworld.report.grouping import Group
 from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.folder import check_inside
@@ -39,7 +42,7 @@ def main(arguments: Sequence[str]) -> None:
     with telling_if_slow("reading the runs"):
         report = gather(options.runs, options.seed, options.log_steps)
     with telling_if_slow("diagnosing runs that are not certified"):
-        found, left_out = reasons(report.study.groups, _reason, options.diagnose)
+        found, left_out = reasons(report.study.groups, options.diagnose)
         report = replace(report, reasons=found, notes=(*report.notes, *left_out))
     with telling_if_slow("writing the report"):
         page = write_report(report, out, options.formats)
@@ -54,7 +57,7 @@ def main(arguments: Sequence[str]) -> None:
         print(line, file=sys.stderr)
     print(printable(str(page)))
     if options.open and not webbrowser.open(page.absolute().as_uri()):
-        print(printable(f"--open: there is no browser here; open {page} in yours"), file=sys.stderr)
+        print(printable(f"--open: no browser found here; open {page} in yours"), file=sys.stderr)
     if sentences:
         sys.exit(1)
 
@@ -62,18 +65,39 @@ def main(arguments: Sequence[str]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("report", __doc__, "runs")
     option = parser.add_argument
-    option("--out", type=Path, help="its folder (default: report/ in the one folder given, else runs/report)")
+    option(
+        "--out",
+        type=Path,
+        help="folder to write to (default: report/ in the only folder given, or runs/report)",
+    )
     option("--open", action="store_true", help="show the page in the browser")
-    readme = f"also put the results into this Markdown file, between its lines {' and '.join(MARKERS)}"
+    readme = f"also write the results into this Markdown file, between its lines {' and '.join(MARKERS)}"
     option("--readme", type=Path, help=readme)
-    formats = f"of the figures' files, any of {' '.join(FORMATS)}; with no word, none (default: all of them)"
+    formats = f"formats of the figures, any of {' '.join(FORMATS)}; none without a word (default: all)"
     option("--formats", nargs="*", choices=FORMATS, default=FORMATS, metavar="FORMAT", help=formats)
-    logarithm = "curves against the logarithm of the steps (without it, where an agent is ten times slower)"
+    logarithm = "curves on a logarithmic step axis (automatic where one agent is ten times slower)"
     option("--log-steps", action="store_true", help=logarithm)
-    most = f"say of so many runs at most why they are not certified (default {_MOST_DIAGNOSED}; 0: of none)"
+    most = f"diagnose at most so many runs that are not certified (default {_MOST_DIAGNOSED}, 0 for none)"
     option("--diagnose", type=whole(0), default=_MOST_DIAGNOSED, metavar="COUNT", help=most)
-    option("--seed", type=whole(0), default=0, help="of the bootstrap (default 0)")
+    option("--seed", type=whole(0), default=0, help="seed of the bootstrap (default 0)")
     return parser
+
+
+def reasons(groups: Iterable[Group], most: int) -> tuple[Reasons, list[str]]:
+    """Why runs are not certified, of so many at most: the first seed of each group before the second of any.
+
+    Also a sentence for each run of which a file is damaged.
+    """
+    found, problems = {}, []
+    columns = ([run for run in group.runs if not run.certified] for group in groups)
+    in_turn = (run for row in itertools.zip_longest(*columns) for run in row if run is not None)
+    for run in itertools.islice(in_turn, most):
+        try:
+            if (reason := _reason(run.folder)) is not None:
+                found[run.folder] = reason
+        except InputError as error:
+            problems.append(f"{run.folder}: is not diagnosed; {error}")
+    return found, problems
 
 
 def _reason(folder: Path) -> Reason | None:

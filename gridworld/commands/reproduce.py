@@ -1,10 +1,9 @@
-"""Run a finished run again, from its manifest, and tell whether it comes to the same, bit for bit.
+"""Repeat a finished run from its manifest, and compare the results bit for bit.
 
-First it tells what differs between then and now: commit and uncommitted changes, versions, processor,
-environment variables. Then it trains again, in a temporary folder, and compares the learning curve, the final
-weights, visits, summary and TensorBoard's points. A run that was made longer is made longer again; one whose
-numbers depend on other runs of its sweep is trained together with these. The exit code is 0 if all are
-identical, 1 if any is not, 2 if that cannot be told.
+It prints what has changed since then: commit and uncommitted changes, versions, processor, environment
+variables. Then it trains again in a temporary folder and compares the learning curve, final weights, visits,
+summary and TensorBoard points. A lengthened run is lengthened again; a run whose numbers depend on other runs
+of its sweep is trained together with them. Exit code: 0 if everything is identical, 1 if not, 2 if undecided.
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ def main(arguments: Sequence[str]) -> None:
         except InputError as error:
             if not (folder / MANIFEST).exists():  # these settings cannot be run here at all
                 raise
-            print(f"  it did not come to its end this time: {printable(str(error))}\ndifferent")
+            print(f"  it did not finish this time: {printable(str(error))}\ndifferent")
             sys.exit(DIFFERENT)
         with telling_if_slow("comparing"):
             findings = list(compare(then, read_run(folder), again, mdp))
@@ -75,15 +74,15 @@ def main(arguments: Sequence[str]) -> None:
         sys.exit(DIFFERENT)
     if None in verdicts:
         raise InputError(
-            f"{options.run}: all that could be compared is identical, but not all of the run is there; put "
-            "its files back to compare them too"
+            f"{options.run}: everything that could be compared is identical, but files of the run are "
+            "missing; restore them to compare them too"
         )
     print("identical")
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("reproduce", __doc__, "run", "--trust")
-    kept = "write the new run there, with its pictures, and keep it"
+    kept = "write the new run to this folder, with its pictures, and keep it"
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help=kept)
     return parser
 
@@ -102,4 +101,4 @@ def _circumstances(run: RunReader) -> Iterator[str]:
         lines = [f"{line} (anyway=true)" for line in differs] if isinstance(differs, list) else []
         if "git" in again:
             lines += source_differences(before, before := again["git"])
-        yield from (f"  went on after step {again.get('step')}: {line}" for line in lines)
+        yield from (f"  resumed after step {again.get('step')}: {line}" for line in lines)

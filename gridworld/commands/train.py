@@ -31,9 +31,9 @@ from gridworld.config.compose import VERSION_BASE, completed, register_schemas, 
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import conf_folder, own_conf_folders, refuse_unclear, sentence, unreadable_file
 from gridworld.errors import EXIT_CODE, InputError
-from gridworld.process.console import printable, tell_error
+from gridworld.process.console import tell_error
 from gridworld.process.user_input import called_from, limited
-from gridworld.run.folder import MANIFEST, SWEEP_JSON, alone_in, check_inside, claimed, shown
+from gridworld.run.folder import MANIFEST, SWEEP_JSON, alone_in, check_inside, claimed, shell_path
 from gridworld.run.reader import check_free, check_is_run, is_started
 from gridworld.storage.atomic_write import check_no_links
 
@@ -112,7 +112,7 @@ class RefuseUsedFolders(Callback):
         _check_place(config, "run")
         for word in config.hydra.overrides.hydra:
             if re.match(r"\+*hydra[./](launcher|sweeper)\b", word):
-                raise InputError(f"{word}: is about a sweep; add -m, or leave it out")
+                raise InputError(f"{word}: applies to sweeps only; add -m, or leave it out")
         folder = Path(config.hydra.run.dir).absolute()  # a job may change the current folder
         check_free(Path(config.hydra.run.dir))
         if config.hydra.output_subdir is not None:
@@ -152,7 +152,7 @@ def _sum_up(sweep: Path, kind: object, error: BaseException | None, trace: objec
     from gridworld.report.writer import write_over_seeds
 
     if (folder := write_over_seeds(sweep, sweep)) is not None:
-        print(f"  over seeds: {printable(shown(folder))}, next to the jobs in TensorBoard")
+        print(f"  curves over seeds: tensorboard --logdir {shell_path(folder)}")
 
 
 def run_job(settings: DictConfig) -> float:
@@ -200,7 +200,7 @@ def resume(words: Sequence[str]) -> None:
     check_inside(folder, _RESUME)
     check_is_run(folder)  # before anything is written there
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise InputError(f"{folder}: is read-only; copy the run to where you may write and resume= the copy")
+        raise InputError(f"{folder}: is read-only; copy the run to a writable folder and resume the copy")
 
     from gridworld.restore.resume import open_unfinished  # here, since it takes a second to import
     from gridworld.run.summary import train_and_tell
@@ -216,11 +216,11 @@ def _resume_words(arguments: Sequence[str]) -> dict[str, str]:
         key, _, text = argument.partition("=")
         if key not in (_RESUME, _STEPS, *_SWITCHES):
             raise InputError(
-                f"{argument}: a run goes on with the settings that it began with; beside {_RESUME}=RUN there "
-                f"are {', '.join([_STEPS, *_SWITCHES])}"
+                f"{argument}: a run is resumed with its own settings; besides {_RESUME}=RUN give only "
+                f"{', '.join([_STEPS, *_SWITCHES])}"
             )
         if key in words:
-            raise InputError(f"{argument}: {key} is given already; give it once")
+            raise InputError(f"{argument}: {key} is given twice; give it once")
         if key in _SWITCHES and text not in ("true", "false"):
             raise InputError(f"{argument}: must be true or false")
         if key == _RESUME and not text:

@@ -1,9 +1,9 @@
 """Search an agent's settings for a task, and confirm the winner on seeds that the search has not seen.
 
-Overrides compose the configuration to begin from, as for train.py. What is searched stands in a file:
+Overrides compose the baseline configuration, as for train.py. The search space is one of:
 {spaces}
-Run the command again to continue the study. On several machines, with tune.storage=URL of a database that all
-reach, they work on it together.
+Run the command again to continue the study. Several machines can work on one study through a shared database,
+tune.storage=URL.
 """
 
 from __future__ import annotations
@@ -37,19 +37,20 @@ _KINDS = ("job", "all")  # of --cfg
 _EPILOG = """\
 keys, in addition to train.py's (with their defaults: --cfg all):
   tune=NAME            another file of conf/tune, or of --config-dir's tune/
-  tune.trials          how many, those of earlier calls included; tune.seeds of each: seed, seed + 1, ...
-  tune.finalists       trials that are run on more seeds, tune.final_seeds; tune.confirm_seeds for the winner
-  tune.study           its name, by which it is resumed; tune.folder, its folder (runs/STUDY)
-  tune.storage         any database URL of Optuna's (an SQLite file in the folder)
+  tune.trials          number of trials, with earlier calls; tune.seeds: seeds of each (seed, seed + 1, ...)
+  tune.finalists       trials to run on tune.final_seeds more seeds; tune.confirm_seeds: for the winner
+  tune.study           name of the study, to resume it; tune.folder: its folder (runs/STUDY)
+  tune.storage         any database URL that Optuna takes (default: an SQLite file in the folder)
 
 examples:
   python scripts/tune.py agent=ppo env=four_rooms
-      a hundred trials of three seeds; then
+      a hundred trials of three seeds
   python scripts/train.py recipe=runs/tune_ppo_four_rooms
+      train with the settings that it found
   python scripts/tune.py agent=ppo tune=mine --config-dir my_conf
-      a search space of your own, my_conf/tune/mine.yaml
+      a custom search space, my_conf/tune/mine.yaml
   python scripts/report.py runs/tune_ppo_four_rooms
-      the study as a page: its history, which settings mattered, the winner's runs
+      the study as a page: its history, the settings that mattered, the winner's runs
 """
 
 
@@ -64,23 +65,21 @@ def main(arguments: Sequence[str]) -> None:
         options.overrides.append(options.cfg)  # a setting
         options.cfg = _KINDS[-1]
     if options.package is not None and not options.cfg:
-        raise InputError(
-            f"--package {options.package}: shows a part of the configuration; it goes with --cfg"
-        )
+        raise InputError(f"--package {options.package}: shows a part of the configuration; use it with --cfg")
     if importlib.util.find_spec("optuna") is None:
         raise InputError(f"{program('tune')}: optuna is not installed; {install_command('tune')}")
     if options.config_dir is not None and not options.config_dir.is_dir():
         raise InputError(f"--config-dir {options.config_dir}: no such folder")
     own = (options.config_dir,) if options.config_dir is not None else ()
-    from gridworld.tune.study_spec import ConfFolders, compose_study
+    from gridworld.tune.study_spec import compose_study
 
-    spec = compose_study(ConfFolders(conf_folder(), own), options.overrides)
+    spec = compose_study(options.overrides, own)
     if options.cfg:
         _show(spec, options.cfg, options.package)
         return
     from gridworld.process.signals import Interrupted
+    from gridworld.tune.search import SearchError
     from gridworld.tune.study import tune
-    from gridworld.tune.workers import SearchError
 
     try:
         tune(spec)
@@ -89,7 +88,7 @@ def main(arguments: Sequence[str]) -> None:
         sys.exit(1)
     except Interrupted as interruption:
         again = shlex.join(command_line())
-        print(printable(f"{interruption}; nothing that ended is lost; resume with: {again}"), file=sys.stderr)
+        print(printable(f"{interruption}; finished trials are kept; resume with: {again}"), file=sys.stderr)
         sys.stderr.flush()
         os._exit(interruption.exit_code)  # finalising the interpreter would take seconds
 
@@ -98,15 +97,14 @@ def _parser(conf: Path) -> argparse.ArgumentParser:
     about = as_called(__doc__ or "").format(spaces="\n".join(choices(conf / "tune")))
     parser = parser_of("tune", about, epilog=as_called(_EPILOG))
     option = parser.add_argument
-    option("overrides", nargs="*", metavar="key=value", help=as_called("train.py's and tune.*"))
-    option("--config-dir", type=Path, help="a folder of your own yaml files, in addition to conf/")
+    option("overrides", nargs="*", metavar="key=value", help=as_called("settings of train.py and tune.*"))
+    option("--config-dir", type=Path, help="a folder with your own yaml files, in addition to conf/")
     option(
         *("--cfg", "-c"),
         nargs="?",
         const=_KINDS[-1],
         metavar="{job,all}",
-        help="print the configuration and do nothing: what the search begins from (job), or that and how to "
-        "search (all, also without a word)",
+        help="print the configuration of the baseline (job), or of the search too (all), and exit",
     )
     option("--package", "-p", help="with --cfg: only this part, such as agent or tune.space")
     return parser
@@ -122,6 +120,6 @@ def _show(spec: StudySpec, kind: str, package: str | None) -> None:
     if package not in (None, "_global_"):
         shown = OmegaConf.select(shown, package)
         if shown is None:
-            raise InputError(f"--package {package}: there is no such part of the configuration")
+            raise InputError(f"--package {package}: no such part of the configuration")
         print(f"# @package {package}")
     print(OmegaConf.to_yaml(shown).rstrip() if OmegaConf.is_config(shown) else shown)

@@ -69,10 +69,8 @@ def named_world(name: str, **settings: Any) -> Mdp:
     elif name.endswith(".txt"):
         env = MapConfig(layout=name)
     else:
-        all_of_them = (
-            f"; give an id of Gymnasium, as FrozenLake-v1, a map's file, or one of {', '.join(names)}"
-        )
-        raise InputError(f"env={name}: there is no such world{meant(name, names) or all_of_them}")
+        all_of_them = f"; give a Gymnasium id such as FrozenLake-v1, a map file, or one of {', '.join(names)}"
+        raise InputError(f"env={name}: no such world{meant(name, names) or all_of_them}")
     known = {field.name for field in dataclasses.fields(env)} - {"source"}
     if wrong := sorted(set(settings) - known):
         raise InputError(f"{wrong[0]}: is not a setting of env={name}{meant(wrong[0], sorted(known))}")
@@ -153,7 +151,7 @@ def _refuse_added_keys(settings: DictConfig, prefix: str = "") -> None:
     known = [field.name for field in dataclasses.fields(schema)] if dataclasses.is_dataclass(schema) else None
     for key in map(str, settings):
         if known is not None and key not in known:
-            raise InputError(f"{prefix}{key}: there is no such key{meant(key, sorted(known))}")
+            raise InputError(f"{prefix}{key}: no such key{meant(key, sorted(known))}")
         is_value = not (OmegaConf.is_missing(settings, key) or OmegaConf.is_interpolation(settings, key))
         if is_value and isinstance(child := settings[key], DictConfig):
             _refuse_added_keys(child, f"{prefix}{key}.")

@@ -90,14 +90,14 @@ class Text(Enum):
 
     WORD = r"(?s).*", "is a word"  # compared, looked up among the program's own, or shown
     FILE = r"[^\x00]*", "leads out of the current folder"  # nor if it is outside, by links or otherwise
-    CLASS = rf"[^.]*|{_OF_LIBRARIES}", f"is from none of {', '.join(LIBRARIES)}"
-    CODE = r"\?\?\?", "is called with the arguments beside it, and may write files"
+    CLASS = rf"[^.]*|{_OF_LIBRARIES}", f"is not from one of {', '.join(LIBRARIES)}"
+    CODE = r"\?\?\?", "is called with the arguments given, and may write files"
     ENV = r"[^:]*", "imports the module before the colon"
     ARGUMENTS = (  # of a class of the libraries; a class may be among them, or a rate that falls
         rf"{_OF_KEYWORD}|(lin|sqrt|quad)_[\d.e+-]+|{_OF_LIBRARIES}",
-        f"is not a plain word, nor a class of {', '.join(LIBRARIES)}",
+        f"is neither a plain word nor a class of {', '.join(LIBRARIES)}",
     )
-    KWARGS = _OF_KEYWORD, "is for code that may take it for a file or a module"  # of code that is not ours
+    KWARGS = _OF_KEYWORD, "is passed to code that may read it as a file or module"  # not ours
 
 
 Word = Annotated[str, Text.WORD]

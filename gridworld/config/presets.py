@@ -55,13 +55,8 @@ def with_preset(
 ) -> tuple[Settings, list[str]]:
     """Compose a command line again with the preset that `preset=auto` becomes.
 
-    Args:
-        config: what the command line composes to, as dataclasses or as Hydra has it.
-        words: the command line, which `compose` composes with further words.
-        world: makes the configured world, or returns an existing one.
-
-    Returns:
-        The settings; the words that were added, if any.
+    `config` is what the command line's `words` compose to, as dataclasses or as Hydra has it; `compose` takes
+    further words. Returns the settings, and the words that were added.
     """
     if config.preset != AUTO or any(map(_CHOSEN_BY_HAND.match, words)):
         return config, []

@@ -45,11 +45,11 @@ def with_recipe(words: Sequence[str]) -> list[str]:
     if not given:
         return list(words)
     if len(given) > 1:
-        raise InputError(f"{given[1]}: {KEY} is given already; give it once")
+        raise InputError(f"{given[1]}: {KEY} is given twice; give it once")
     rest = [word for word in words if word != given[0]]
     for word in rest:
         if word.lstrip("+").startswith("experiment="):
-            raise InputError(f"{word}: chooses another recipe in addition to {given[0]}; give one of them")
+            raise InputError(f"{word}: is a second recipe after {given[0]}; give one of them")
     truths = [word for word in rest if word.startswith(f"{TRUST}=")]
     if not set(truths) <= {f"{TRUST}=true", f"{TRUST}=false"}:
         raise InputError(f"{truths[0]}: must be true or false")
@@ -59,12 +59,12 @@ def with_recipe(words: Sequence[str]) -> list[str]:
 
 
 def _file(word: str) -> Path:
-    given = word.partition("=")[2]
+    given = word.partition("=")[2].strip("'\"")
     if not given:
         raise InputError(f"{word}: must be a recipe's yaml, or the folder of a study")
     path = Path(given)
     if not path.exists():
-        raise InputError(f"{word}: there is no such file; must be a recipe's yaml, or the folder of a study")
+        raise InputError(f"{word}: no such file; must be a recipe's yaml, or the folder of a study")
     if not path.is_dir():
         return path
     if (path / IN_A_STUDY[0]).is_symlink():
@@ -76,7 +76,7 @@ def overrides(path: Path, trust: bool = False) -> list[str]:
     """The overrides of a recipe, choices first; with `trust` it may run code and read files."""
     content = _read(path)
     if not isinstance(content, dict):
-        raise InputError(f"{path}: holds no settings")
+        raise InputError(f"{path}: contains no settings")
     choices = list(_choices(content.pop("defaults", []), path))
     values = list(_values(content, path))
     if not trust:

@@ -54,7 +54,7 @@ def agent_schemas() -> dict[str, type[AgentConfig]]:
     found: dict[str, type[AgentConfig]] = {}
     agents = importlib.import_module("gridworld.agents")
     for family in pkgutil.iter_modules(agents.__path__):
-        found |= importlib.import_module(f"{agents.__name__}.{family.name}").schemas()
+        found |= importlib.import_module(f"{agents.__name__}.{family.name}").SCHEMAS
     return found
 
 
@@ -183,7 +183,7 @@ def check_foreign(settings: Mapping[str, Any], where: str, allow: str) -> None:
     """
     for name, value, harm in foreign(settings):
         setting = printable(f"{name[:200]}={str(value)[:80]}")
-        raise InputError(f"{where}: {setting} {harm}; add {allow} if you trust whoever made this")
+        raise InputError(f"{where}: {setting} {harm}; add {allow} if you trust its author")
 
 
 def foreign(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any, str]]:
@@ -253,7 +253,7 @@ def read_config(content: Any, where: str) -> TrainConfig:
     if not own and "arguments" in agent:  # of any class, whose schema names no algorithm
         own = [schema for schema in schemas if schema.algorithm == MISSING]
     if not own:
-        raise InputError(f"{where}: config.agent.algorithm={_shown(algorithm)} is not known here")
+        raise InputError(f"{where}: config.agent.algorithm={_shown(algorithm)} is unknown")
     stand_in = {AgentConfig: own[0], EnvConfig: schema_of(content.get("env"))}
     config = _read(TrainConfig, content, f"{where}: config", stand_in)
     assert isinstance(config, TrainConfig)
@@ -263,7 +263,7 @@ def read_config(content: Any, where: str) -> TrainConfig:
 def _read(schema: type, content: Any, where: str, stand_in: dict[type, type], section: str = "") -> object:
     hints = get_type_hints(schema)
     if not isinstance(content, dict):
-        raise InputError(f"{where}: must be settings, is {_shown(content)}")
+        raise InputError(f"{where}: must be a mapping, is {_shown(content)}")
     # A run from before there was a setting is read with its default, where the result does not depend on it.
     optional = {
         name

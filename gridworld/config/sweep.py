@@ -17,9 +17,9 @@ class SweepConfig:
 
     _target_: str = "hydra_plugins.gridworld_sweeper.GridWorldSweeper"
     retry_failed: bool = False  # run again what failed
-    stop_at_first_failure: bool = False  # leave the rest for later
+    stop_at_first_failure: bool = False  # leave the others for later
     extend: bool = False  # use the folder of a sweep that shares no job with this one
-    max_jobs: int = 10_000  # more are taken for a slip
+    max_jobs: int = 10_000  # more are refused as a mistake
     params: dict[str, Any] = field(default_factory=dict)  # settings and their values, as on a command line
     paired: list[Any] = field(default_factory=list)  # swept settings that vary together, or lists of such
     population: int | str | None = "auto"  # runs that train as one; 1: each alone
@@ -79,7 +79,7 @@ class DimensionConfig:
     type: str = MISSING  # float, int, categorical
     low: float | None = None  # of a range, included
     high: float | None = None  # the same
-    log: bool = False  # even on a logarithmic scale
+    log: bool = False  # uniform on a logarithmic scale
     step: float | None = None  # between the values of a range
     choices: list[Any] | None = None  # of a categorical one
 
@@ -90,23 +90,23 @@ class TuneConfig:
 
     trials: int = setting(100, bounds(1))  # the search ends after so many
     seeds: int = setting(3, bounds(1, _MOST_RUNS))  # a trial's: seed, seed + 1, ...
-    # trials that go on to more seeds, with what the search began from
+    # trials that run on more seeds, together with the baseline
     finalists: int = setting(5, bounds(1, _MOST_RUNS))
     final_seeds: int = setting(10, bounds(0, _MOST_RUNS))  # the next ones, for the finalists
-    # the next ones, for the winner and for what the search began from
+    # the next ones, for the winner and the baseline
     confirm_seeds: int = setting(20, bounds(2, _MOST_RUNS))
     study: str | None = None  # its name; null: of agent and world
     folder: str | None = None  # null: runs/STUDY
     storage: str | None = None  # any URL that Optuna takes; null: study.db in the folder
-    workers: int = setting(-1, bounds(-1))  # processes; -1 for one on each core
+    workers: int = setting(-1, bounds(-1))  # processes; -1: one per core
     together: int | None = setting(None, bounds(1))  # trials of a worker at once; null: 8 of all, 1 of one
-    timeout: float | None = setting(None, bounds(0, above=True))  # seconds; no trial begins after that
+    timeout: float | None = setting(None, bounds(0, above=True))  # seconds; no trial starts after that
     sampler: str = "tpe"  # or random
     sampler_seed: int = setting(0, bounds(0))  # of the search itself
     pruner: str = "median"  # or hyperband, none
-    # of a seed, at least, so that who is certified sooner shows
+    # per seed, at least, to resolve which trial is certified sooner
     evaluations: int = setting(50, bounds(1, _MOST_LOOKS))
-    reports: int = setting(10, bounds(1, _MOST_LOOKS))  # looks of the pruner at a seed's curve
+    reports: int = setting(10, bounds(1, _MOST_LOOKS))  # pruner's looks at a seed's curve
     stop_after: int | None = setting(3, bounds(1))  # a trial's seed ends at this many certificates in a row
     space: dict[str, DimensionConfig] = field(default_factory=dict)  # conf/tune/*.yaml
 

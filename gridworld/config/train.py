@@ -43,7 +43,10 @@ _PICTURE = "picture"  # in a field's metadata
 
 @dataclass
 class AgentConfig:
-    """The settings of any agent; an agent's own schema is in its family's package in `gridworld.agents`."""
+    """The settings of any agent, by which it is checked and built; a family of agents derives its schemas.
+
+    They are in its package in `gridworld.agents`, and are read without what an agent needs to learn.
+    """
 
     name: Word = setting(MISSING, affects(Effect.LABELS))  # in tables and folders
     family: Word = MISSING  # the package in `gridworld.agents`
@@ -66,6 +69,28 @@ class AgentConfig:
     def memory(self, num_states: int, num_envs: int, total_timesteps: int) -> int:
         """About the bytes that a run of it takes while it trains, the larger part at least."""
         return 0
+
+    def check(self, run: TrainConfig) -> None:
+        """Check a run's settings; InputError: the first one that could not train as it says."""
+        for key in ("family", "algorithm"):
+            given, own = getattr(self, key), getattr(type(self), key)
+            if own not in (given, MISSING):
+                raise InputError(f"agent.{key}={given}: these settings are {own}'s; choose agent=...")
+
+    def build(self, context: Any) -> Any:
+        """Build an `Agent` in a `TrainingContext`; InputError: a setting that only its library can judge."""
+        raise NotImplementedError
+
+    def import_libraries(self) -> None:
+        """Import what training takes; settings that cannot work are left for the run to refuse."""
+
+    def on_processor(self, device: str) -> bool:
+        """Whether a run with this `device` computes on the processor, not on a GPU."""
+        return True
+
+    def weights(self, path: Path, most: int) -> dict[str, Any]:
+        """The arrays of a model file by name; InputError: it has more than `most` bytes, or is damaged."""
+        raise NotImplementedError
 
 
 @dataclass
@@ -103,6 +128,7 @@ class LoggingConfig:
     # evaluations between two pictures of the policy; 0 for none
     policy_map_every: int = setting(5, bounds(0))
     progress: bool = setting(True, affects(Effect.NOTHING))
+    wandb: bool = setting(False, affects(Effect.NOTHING))  # log the scalars to W&B as well, while it trains
 
 
 @dataclass(frozen=True)
@@ -156,7 +182,8 @@ class RecordingConfig:
     frames: bool = setting(True, {_PICTURE: Picture("frames", "episode.episode")})
     gif: bool = setting(True, {_PICTURE: Picture("episode.gif", "episode.episode")})
     mp4: bool = setting(False, {_PICTURE: Picture("episode.mp4", "episode.episode")})
-    cell_size: int | None = setting(None, bounds(2))  # pixels of the episode's; null: 100, less on large maps
+    # pixels of a cell of the episode and of learning.gif; null: what fits
+    cell_size: int | None = setting(None, bounds(2))
     fps: int = setting(4, bounds(1, 100))  # frames a second
 
 

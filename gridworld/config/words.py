@@ -23,11 +23,11 @@ _FLOAT = re.compile(r"(?<![\w.$'\"])[-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+
 _SENTENCES = (  # a pattern of a message of Hydra's: what is said instead
     (
         r"Config group override must be a string|^argument of type '\w+' is not iterable$",
-        "a choice is a name, and null is none: write preset=none, tuned=none, or ~experiment",
+        "a choice must be a name, not null; write preset=none, tuned=none, or ~experiment",
     ),
     (
         r"Interpolation key '([^']*)' not found",
-        "{}: is missing, and other settings refer to it; give it a value",
+        "{}: is missing, but other settings refer to it; give it a value",
     ),
     (
         r"Error resolving interpolation '\$\{env\}_\$\{agent\}'",
@@ -35,7 +35,7 @@ _SENTENCES = (  # a pattern of a message of Hydra's: what is said instead
     ),
     (
         r"Multiple values for (\S+)\. To override a value use 'override \S+: (.*)'",
-        "+{0}={1}: {0} has a place for its choice already, which a plus would add; write {0}={1}",
+        "+{0}={1}: {0} is always chosen, so it takes no plus; write {0}={1}",
     ),
 )
 _HINTS = (  # a pattern of what is said: what would have been right
@@ -43,9 +43,11 @@ _HINTS = (  # a pattern of what is said: what would have been right
     ("Could not append to config", "; leave out the plus"),
     (
         r"'\d+\.0' of type 'float' could not be converted to Integer",
-        "; in a yaml, write a whole number without point and exponent",
+        "; in YAML, write whole numbers without a decimal point or exponent",
     ),
+    (r"Value '\d+(\.\.|-)\d+'", "; a range, for -m, is range(1,6)"),
 )
+_SYNTAX = ": is not valid syntax; is a comma, a bracket or a quotation mark missing or left over?"
 _LISTED = 24  # choices of a group that are listed at most; of more, those with a similar name
 _PACKAGE = Path(__file__).parents[1]
 _WITH_VALUE = (  # Hydra's options that the next word belongs to
@@ -99,8 +101,8 @@ def _check_recipe(name: str, folders: Sequence[Path]) -> None:
     known = sorted(file.stem for folder in folders for file in (folder / "tuned").glob("*.yaml"))
     if re.fullmatch(r"\w+", name) and name not in known:
         near = difflib.get_close_matches(name, known)
-        hint = f"; close to it are {', '.join(near)}" if near else ""
-        raise InputError(f"tuned={name}: there is no such recipe{hint}; --help lists them all")
+        hint = f"; close matches: {', '.join(near)}" if near else ""
+        raise InputError(f"tuned={name}: no such recipe{hint}; --help lists them all")
 
 
 @functools.cache
@@ -150,7 +152,7 @@ def sentence(error: BaseException) -> str:
         return f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is not valid YAML: {problem}"
     if missing := re.search(r"[Mm]issing mandatory value: (\S+)", message):
         key = missing[1] if "." in missing[1] else getattr(error, "full_key", None) or missing[1]
-        return f"{key}: has no value; give {key}=..., or have the yaml that is chosen for it do so"
+        return f"{key}: has no value; give {key}=..., or set it in a yaml file"
     for pattern, words in _SENTENCES:
         if found := re.search(pattern, message):
             return words.format(*found.groups())
@@ -163,7 +165,12 @@ def sentence(error: BaseException) -> str:
     override = getattr(error, "override", None)
     if override and override not in facts[0]:
         facts.insert(0, override)
-    return ": ".join(fact.strip().rstrip(".:") for fact in facts) + _suggestion(" ".join(facts), message)
+    text = ": ".join(fact.strip().rstrip(".:") for fact in facts)
+    text = re.sub(
+        r"Could not override '([^']*)': Key '[^']*' not in '(\w+)'", r"\1: no such setting in \2", text
+    )
+    text = re.sub(r": (mismatched input|no viable alternative|extraneous input|token recog).*", _SYNTAX, text)
+    return text + _suggestion(" ".join(facts), message)
 
 
 def unreadable_file(error: Exception, folders: Iterable[Path]) -> str:
@@ -193,14 +200,14 @@ def _unknown_choice(message: str) -> str:
     where, _, name = missing.group(1).rpartition("/")
     if where == "experiment":
         choices = sorted({*choices, *pairs()})
-    fact = f"{where}={name}: there is no such choice"
+    fact = f"{where}={name}: no such choice"
     if where == "env" and re.search(r"-v\d+$", name):
-        return f"{fact}; an environment of Gymnasium is env=gymnasium env.id={name}{meant(name, choices)}"
+        return f"{fact}; for a Gymnasium environment, write env=gymnasium env.id={name}{meant(name, choices)}"
     if len(choices) <= _LISTED:
-        return f"{fact}; there are {', '.join(choices)}{meant(name, choices)}"
+        return f"{fact}; choose from {', '.join(choices)}{meant(name, choices)}"
     near = [choice for choice in choices if choice.startswith(name)]
     near = near or difflib.get_close_matches(name, choices)
-    hint = f"; close to it are {', '.join(near)}" if near else ""
+    hint = f"; close matches: {', '.join(near)}" if near else ""
     return f"{fact}{hint}; --help lists them all"
 
 
@@ -211,7 +218,7 @@ def _suggestion(facts: str, message: str) -> str:
     if added := re.search(r"Could not override '([^']*)'.*Key '([^']*)' is not in struct", facts, re.DOTALL):
         place, name = added.groups()
         if place.startswith("tune.space"):
-            return "; what is searched is written in a yaml of conf/tune, which tune=NAME chooses"
+            return "; the search space is a yaml file in conf/tune, chosen by tune=NAME"
         entry = place if place.endswith(f".{name}") else f"{place}.{name}"
         return f"; a new entry of a dictionary needs a plus: +{entry}=..."
     if unknown := re.search(r"Key '([^']*)' not in '\w+'", facts):
@@ -230,14 +237,18 @@ def _alike(name: str, key: str) -> str:
     if near := meant(key, sorted({each.partition(".")[0] for each in own} - {key})):
         return near
     last = {each: each.rpartition(".")[2] for each in known if each.partition(".")[0] != section}
-    alike = difflib.get_close_matches(key, set(last.values()), n=1, cutoff=0.8)
+    alike = _similar(key, sorted(set(last.values())), n=1, cutoff=0.8)
     return _or(sorted(each for each, part in last.items() if [part] == alike)) or "; --cfg job shows all keys"
 
 
 def meant(key: str, known: list[str]) -> str:
     """The names that `key` looks like, or is the initials of, as a question; "" if there is none."""
+    return _or(_similar(key, known))
+
+
+def _similar(key: str, known: list[str], n: int = 3, cutoff: float = 0.6) -> list[str]:
     initials = [name for name in known if "_" in name and "".join(w[:1] for w in name.split("_")) == key]
-    return _or(initials or difflib.get_close_matches(key.lower(), known, n=3))
+    return initials or difflib.get_close_matches(key.lower(), known, n, cutoff)
 
 
 def _or(names: list[str]) -> str:

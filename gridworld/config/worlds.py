@@ -49,7 +49,7 @@ class EnvConfig:
         limit = self.max_episode_steps or mdp.max_episode_steps or STEP_LIMIT
         if limit > MOST_STEPS:
             raise InputError(
-                f"env.max_episode_steps: {mdp.name} has a step limit of {limit:,} of its own; give one of at "
+                f"env.max_episode_steps: {mdp.name} has its own step limit of {limit:,}; give one of at "
                 f"most {MOST_STEPS:,}"
             )
         return limit

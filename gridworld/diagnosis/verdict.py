@@ -46,7 +46,7 @@ class Trial:
     why: str = ""  # why it did not come to its end
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis:
     """Why a run is not optimal."""
 
@@ -79,6 +79,9 @@ class Diagnosis:
     def first_change(self) -> str:
         """The word for a command line to try first; "" where there is none."""
         return next((each.changes[0] for each in self.findings[:1] if each.changes), "")
+
+    def __repr__(self) -> str:
+        return "\n  to try: ".join([f"Diagnosis: {self.sentence()}", *map(shlex.join, self.offers)])
 
     def sentence(self) -> str:
         """The verdict in one sentence."""
@@ -191,6 +194,7 @@ def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:
         table.legend(scale, "regret")
         return table.frame()
     canvas = Canvas(mdp, cell_size)
+    cost = canvas.board.summed(cost)
     scale = linear(ORANGES, cost[canvas.board.floor], low=0.0)
     colours = scale.colours(cost)
     colours[cost == 0] = PAPER

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from gridworld.engine.networks import Array
-from gridworld.engine.on_policy import Coefficients, OnPolicy, log_softmax, losses_of, slopes_of
+from gridworld.engine.on_policy import OnPolicy, log_softmax, losses_and_slopes
 from gridworld.world.mdp import IntArray
 
 
@@ -19,12 +19,11 @@ class A2C(OnPolicy):
         ((states, sums),) = self.summed_up(pairs[:, None], advantages[:, None], returns[:, None])
         logits, values = self.networks.run(states)
         new = log_softmax(logits), values[..., 0]
-        nothing = np.zeros((len(self.runs), 1, 1))
-        coefficients = Coefficients(nothing, None, self.column("ent_coef"), self.column("vf_coef"))
-        slopes = slopes_of(new, new, sums, coefficients)
-        self.networks.backward(slopes[0], slopes[1][..., None])
+        settings = {name: self.column(name) for name in ("ent_coef", "vf_coef")}
+        none = np.zeros((len(self.runs), 1, 1))
+        losses, of_logits, of_values = losses_and_slopes(new, new, sums, clip_range=none, **settings)
+        self.networks.backward(of_logits, of_values[..., None])
         self.check(self.optimizer.step(self.settings("learning_rate"), self.active), "the gradient")
-        losses = losses_of(new, new, sums, coefficients)
         policy_loss = -((sums.positive + sums.negative) * new[0]).sum(axis=(-2, -1))
         for run in self.going():
             run.model._n_updates += 1

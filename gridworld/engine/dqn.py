@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
-from gridworld.engine.environments import Step
-from gridworld.engine.networks import Array, Networks
-from gridworld.engine.population import FEW_STATES, Population, Run, make_networks
+from gridworld.engine.networks import Array, Networks, make_networks
+from gridworld.engine.population import FEW_STATES, Population, Run, met_states
 from gridworld.engine.replay import CountedReplay, Replay, Transitions, UniformReplay
+from gridworld.envs.vector_env import Step
 from gridworld.storage.serialization import State
 from gridworld.world.mdp import FloatArray, IntArray
 
@@ -32,7 +32,8 @@ class DQN(Population):
         self._outputs: Array | None = None  # of the networks as they are, of all states
         self._greedy: IntArray | None = None  # (P, S), by these
         self._best: Array | None = None  # (P, S), what the target networks say of each state's best action
-        self.target = make_networks(runs, lambda run: run.target_parameters, is_target=True)
+        targets = [run.target for run in runs if run.target is not None]
+        self.target = make_networks(targets, met_states(runs[0]))
         model, envs = runs[0].model, runs[0].envs
         self.replay: Replay = (
             CountedReplay(len(runs), envs.mdp.num_states, envs.mdp.num_actions)
@@ -55,13 +56,13 @@ class DQN(Population):
         by_episode = self.train_freq.unit is TrainFrequencyUnit.EPISODE
         while (episodes if by_episode else steps) < self.train_freq.frequency:
             states, actions = self.environments.states, self._act()
-            step = self.environments.step(actions.astype(np.int64, copy=False))
+            step = self.environments.take(actions)
             steps, episodes = steps + 1, episodes + len(step.which)
             self.num_timesteps += self.num_envs
             self._count(step, is_last=steps == self.train_freq.frequency)
             if not self.active.any():
                 return
-            columns = states, actions, step.last_states, step.rewards, step.terminated
+            columns = states, actions, step.reached, step.rewards, step.terminated
             self.replay.store(*(each.reshape(len(self.runs), -1) for each in columns))  # type: ignore[arg-type]
             self._after_step(step)
         if self.num_timesteps > self.learning_starts:
@@ -94,8 +95,7 @@ class DQN(Population):
             return found[index]
         if self._greedy is None:
             self._greedy = self.q_of(self.outputs).argmax(axis=-1)
-        greedy: IntArray = self._greedy[row].take(states)
-        return greedy
+        return self._greedy[row].take(states)
 
     def _count(self, step: Step, is_last: bool) -> None:
         """Count a step of each run, and call what wants to be called after it."""
@@ -137,7 +137,7 @@ class DQN(Population):
     def _update(self, steps: int) -> None:
         """Make gradient steps, each on a minibatch of its own."""
         if self._best is None:
-            self._best = self.of_best_action(self._shaped(self.target.run()[0]))
+            self._best = self.of_best_action(self._shaped(self.target.run_met()[0]))
         going, best, learning_rates = self.active.copy(), self._best, self.settings("learning_rate")
         gamma = np.array([run.model.gamma for run in self.runs], dtype=np.float32)[:, None]
         at_once, losses = max(1, _DRAWN_AT_ONCE // self.replay.width(self.batch_size)), []
@@ -169,8 +169,7 @@ class DQN(Population):
         """(n, P, B): rewards and what the target network expects of the best action in the next state."""
         row = (np.arange(len(self.runs)) * self.num_states)[:, None]
         values = best.take(drawn.following + row)
-        targets: Array = drawn.rewards + (1 - drawn.ends) * gamma * values
-        return targets
+        return drawn.rewards + (1 - drawn.ends) * gamma * values
 
     def _slopes(
         self, states: IntArray, actions: IntArray, targets: Array, shares: FloatArray | None
@@ -203,8 +202,7 @@ class DQN(Population):
     @staticmethod
     def of_best_action(outputs: Array) -> Array:
         """What a target network's outputs say of each state's best action."""
-        best: Array = outputs.max(axis=-1)
-        return best
+        return outputs.max(axis=-1)
 
     @staticmethod
     def losses_and_slopes(
@@ -230,7 +228,8 @@ class DQN(Population):
         return q.max(axis=-1), None, q
 
     def weights(self, run: Run) -> dict[str, tuple[Networks, Sequence[torch.Tensor]]]:
-        return {**super().weights(run), "target_weights": (self.target, run.target_parameters)}
+        assert run.target is not None
+        return {**super().weights(run), "target_weights": (self.target, run.target.parameters)}
 
     def get_state(self, run: Run) -> State:
         return {

@@ -7,9 +7,10 @@ in the same order. Rows begin at multiples of 64 bytes, as tensors of their own 
 
 from __future__ import annotations
 
+import copy
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Literal, cast
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, Self, cast
 
 import numpy as np
 import torch
@@ -48,14 +49,41 @@ def cut(vectors: Tensor, shapes: Sequence[torch.Size]) -> list[Tensor]:
     return [part.view(*part.shape[:-1], *shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
-def copy_row(row: Tensor, parameters: Sequence[Tensor]) -> None:
-    """Copy a row (W,) of weights into parameters of these shapes."""
-    parts = cut(row, [parameter.shape for parameter in parameters])
-    for parameter, part in zip(parameters, parts, strict=True):
-        parameter.data.copy_(part)  # which may be a view of the row, and leaves a graph as it is
+class _Rows:
+    """The weights of P networks, whole or the part of them that can change.
+
+    Attributes:
+        weights: (P, W), those that learn.
+        kept: (W,), which places of an SB3 row they are, where a row holds more; None: all of it.
+    """
+
+    weights: Tensor
+    kept: Tensor | None = None
+    _whole: Tensor  # where a row holds more, all of it; stale until `whole`
+
+    def whole(self) -> Tensor:
+        """All weights, one row for each network."""
+        if self.kept is None:
+            return self.weights
+        self._whole[:, self.kept] = self.weights
+        return self._whole
+
+    def set_row(self, run: int, row: Tensor) -> None:
+        """Set all weights of one network."""
+        if self.kept is not None:
+            self._whole[run] = row
+        self.weights[run] = row if self.kept is None else row[self.kept]
+
+    def spread(self, vector: Tensor) -> Tensor:
+        """A row of all weights, from one (W,) of those that learn; the others are 0."""
+        if self.kept is None:
+            return vector
+        row = vector.new_zeros(self._whole.shape[1])
+        row[self.kept] = vector
+        return row
 
 
-class DenseNetworks:
+class DenseNetworks(_Rows):
     """Linear layers with tanh or ReLU between them, differentiated by hand.
 
     A layer is a batched product of (P, U, in) with (P, in, out), which makes for each network the product
@@ -66,6 +94,8 @@ class DenseNetworks:
         parameters: those of one network, in the order of a row.
         nets: the layers of each output.
         features: (S, n), what the first layers see of each state; None: its unit vector.
+        met: (U,), the only states that are ever met: in their columns alone, first layers of unit vectors
+            learn. None: all are.
     """
 
     def __init__(
@@ -74,11 +104,22 @@ class DenseNetworks:
         parameters: Sequence[Tensor],
         nets: Sequence[Sequence[nn.Module]],
         features: Tensor | None,
+        met: IntArray | None = None,
     ) -> None:
-        self.weights, self.gradients = aligned(vectors), aligned(torch.zeros_like(vectors))
-        self._features = None if features is None else features.expand(len(vectors), *features.shape)
         place = {id(parameter): number for number, parameter in enumerate(parameters)}
         self._shapes = [parameter.shape for parameter in parameters]
+        self._met = None if met is None else torch.as_tensor(met, device=vectors.device)
+        if self._met is not None:
+            self._whole, firsts = vectors.clone(), [place[id(net[0].weight)] for net in nets]
+            self._columns = [cut(self._whole, self._shapes)[first].transpose(1, 2) for first in firsts]
+            places = cut(torch.arange(vectors.shape[1], device=vectors.device), self._shapes)
+            for first in firsts:
+                places[first] = places[first][:, self._met]
+            self._shapes = [each.shape for each in places]
+            self.kept = torch.cat([each.reshape(-1) for each in places])
+            vectors = vectors[:, self.kept]
+        self.weights, self.gradients = aligned(vectors), aligned(torch.zeros_like(vectors))
+        self._features = None if features is None else features.expand(len(vectors), *features.shape)
         self._places = [
             [(place[id(each.weight)], place[id(each.bias)]) for each in layers if isinstance(each, nn.Linear)]
             for layers in nets
@@ -95,29 +136,44 @@ class DenseNetworks:
         return [[(views[weight], views[bias]) for weight, bias in pairs] for pairs in self._places]
 
     @staticmethod
-    def fit(nets: Iterable[Sequence[nn.Module]], parameters: Sequence[Tensor]) -> bool:
-        """Whether networks are made of such layers alone, and have no other parameters."""
-        layers = [layer for net in nets for layer in net]
+    def fit(network: StateNetwork) -> bool:
+        """Whether a network is made of such layers alone, and has no other parameters."""
+        layers = [layer for net in network.layers for layer in net]
         linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
         kinds = {type(layer) for layer in layers} - {nn.Linear}
         own = {id(each) for layer in linear for each in (layer.weight, layer.bias)}
         alternate = all(
             isinstance(layer, nn.Linear) == (place % 2 == 0)
-            for net in nets
+            for net in network.layers
             for place, layer in enumerate(net)
         )
         known = len(kinds) <= 1 and kinds <= _FORWARD.keys()
-        return known and alternate and own == {id(each) for each in parameters}
+        return known and alternate and own == {id(each) for each in network.parameters}
 
     def run(self, states: IntArray | None = None) -> tuple[Array, ...]:
         """Outputs (P, U, n) of states (U,), only where P is 1, or of all; the next run may overwrite them."""
         self._states = None if states is None else torch.as_tensor(states, device=self.weights.device)
-        self._passes = [self._run(net) for net in self._nets]
+        if self._met is not None:
+            if self._states is None:
+                self.whole()
+            else:
+                self._states = torch.searchsorted(self._met, self._states)
+        self._passes = [self._run(number) for number in range(len(self._nets))]
         return tuple(np.asarray(passed[-1].cpu()) for passed in self._passes if passed[-1] is not None)
 
-    def _run(self, net: list[tuple[Tensor, Tensor]]) -> list[Tensor | None]:
+    def run_met(self) -> tuple[Array, ...]:
+        """Outputs (P, S, n), of the states that are ever met; 0 in the others."""
+        if self._met is None:
+            return self.run()
+        found, count = self.run(self._met.cpu().numpy()), self._columns[0].shape[1]
+        tables = [np.zeros((each.shape[0], count, each.shape[2]), each.dtype) for each in found]
+        for table, each in zip(tables, found, strict=True):
+            table[:, self._met.cpu().numpy()] = each
+        return tuple(tables)
+
+    def _run(self, output: int) -> list[Tensor | None]:
         """The inputs of all layers, and the output behind the last one."""
-        states, features = self._states, self._features
+        net, states, features = self._nets[output], self._states, self._features
         found: list[Tensor | None] = [
             features if features is None or states is None else features.index_select(1, states)
         ]
@@ -125,7 +181,11 @@ class DenseNetworks:
             inputs = found[-1]
             if inputs is None:
                 columns = weight.transpose(1, 2)
-                outputs = (columns if states is None else columns[:, states]) + bias[:, None]
+                if states is not None:
+                    columns = columns[:, states]
+                elif self._met is not None:
+                    columns = self._columns[output]
+                outputs = columns + bias[:, None]
             elif weight.shape[1] == 1 and inputs.stride(1) == 1:  # which a batch would add up otherwise
                 rows = zip(inputs, weight, bias, strict=True)
                 outputs = torch.stack([nn.functional.linear(*row) for row in rows])
@@ -146,7 +206,8 @@ class DenseNetworks:
                 if inputs is not None:
                     of_weight.copy_(torch.bmm(slope.transpose(1, 2), inputs))
                 elif self._states is None:
-                    of_weight.copy_(slope.transpose(1, 2))
+                    columns = slope if self._met is None else slope[:, self._met]
+                    of_weight.copy_(columns.transpose(1, 2))
                 else:
                     of_weight.zero_()
                     of_weight[:, :, self._states] = slope.transpose(1, 2)
@@ -186,7 +247,7 @@ class DenseNetworks:
         return moved
 
 
-class ModuleNetworks:
+class ModuleNetworks(_Rows):
     """Any network of one run, differentiated by torch; its parameters become views of its row of weights."""
 
     def __init__(
@@ -209,6 +270,9 @@ class ModuleNetworks:
         with torch.enable_grad():
             self._outputs = self._forward(states)
         return tuple(output.detach().cpu().numpy()[None] for output in self._outputs)
+
+    def run_met(self) -> tuple[Array, ...]:
+        return self.run()
 
     def backward(self, *slopes: Array) -> None:
         self.gradients.zero_()
@@ -236,8 +300,8 @@ class ModuleNetworks:
 Networks = DenseNetworks | ModuleNetworks
 
 
-class Inputs:
-    """Feeds a policy's networks with states.
+class StateNetwork:
+    """A network of SB3's policy, or its target network, which sees states.
 
     Features that no parameter has a part in are a table, made once. So are the distinct squares of pixels of
     all images, which is what a network begins with that learns from pixels. A one-hot row times the first
@@ -246,7 +310,8 @@ class Inputs:
     Args:
         policy: the policy.
         observation: what it sees of a state.
-        nets: the layers of each of its outputs.
+        layers: those of each output, behind the features.
+        parameters: its own, in the order of its optimiser and of a row.
         extractors: the modules that make features of observations, one, or one for each output.
         extract: makes features of observations (U, *shape): a tensor, or one for each output.
     """
@@ -255,19 +320,27 @@ class Inputs:
         self,
         policy: BasePolicy,
         observation: ObservationTable,
-        nets: Sequence[Sequence[nn.Module]],
+        layers: Sequence[Sequence[nn.Module]],
+        parameters: Sequence[nn.Parameter],
         extractors: Sequence[Any],
         extract: Callable[[Tensor], Any],
     ) -> None:
-        self._policy, self._observation, self._nets = policy, observation, nets
+        self.layers, self.parameters = layers, parameters
+        self._policy, self._observation, self._outputs = policy, observation, slice(None)
         self._extractors, self._extract = extractors, extract
         kinds = {_kind(each) for each in extractors}
         kind = kinds.pop() if len(kinds) == 1 else "any"
-        begin_linear = all(len(net) > 0 and isinstance(net[0], nn.Linear) for net in nets)
+        begin_linear = all(len(net) > 0 and isinstance(net[0], nn.Linear) for net in layers)
         self.is_look_up = kind == "flat" and begin_linear and _is_one_hot(observation)
         self._is_fixed = kind in ("flat", "fixed")
         self._is_learned = kind == "patches"
         self._all: Any = None  # of all states, the features if these never change, else the observations
+
+    def part(self, outputs: slice, parameters: Sequence[nn.Parameter]) -> Self:
+        """The part of it that makes some of its outputs with these parameters."""
+        part = copy.copy(self)
+        part.layers, part.parameters, part._outputs = self.layers[outputs], parameters, outputs
+        return part
 
     def rows(self, states: IntArray) -> NDArray[Any]:
         """The observations (U, *shape) of states (U,)."""
@@ -288,10 +361,10 @@ class Inputs:
     def forward(self, states: IntArray | None) -> tuple[Tensor, ...]:
         """Run the policy's own modules on states (U,), or on all: (U, n) of each output, with its graph."""
         if self.is_look_up:
-            return tuple(_look_up(*net, states=states) for net in self._nets)
+            return tuple(_look_up(*net, states=states) for net in self.layers)
         features = self._features(states)
-        given = features if isinstance(features, tuple) else (features,) * len(self._nets)
-        return tuple(_run(net, each) for net, each in zip(self._nets, given, strict=True))
+        given = features[self._outputs] if isinstance(features, tuple) else (features,) * len(self.layers)
+        return tuple(_run(net, each) for net, each in zip(self.layers, given, strict=True))
 
     def _features(self, states: IntArray | None) -> Any:
         if states is not None:
@@ -324,9 +397,18 @@ class Inputs:
         return cast(Tensor, tensor)
 
 
+def make_networks(networks: Sequence[StateNetwork], met: IntArray | None = None) -> Networks:
+    """Those of P policies at once, with the weights that SB3's models have; see `DenseNetworks` for `met`."""
+    first, table = networks[0], networks[0].table()
+    vectors = [torch.cat([each.detach().reshape(-1) for each in own.parameters]) for own in networks]
+    if DenseNetworks.fit(first) and (first.is_look_up or table is not None):
+        return DenseNetworks(torch.stack(vectors), first.parameters, first.layers, table, met)
+    assert len(networks) == 1
+    return ModuleNetworks(vectors[0], first.parameters, first.forward)
+
+
 def _kind(extractor: Any) -> Kind:
-    kind: Kind = "flat" if type(extractor) is FlattenExtractor else getattr(extractor, "kind", "any")
-    return kind
+    return "flat" if type(extractor) is FlattenExtractor else getattr(extractor, "kind", "any")
 
 
 def _is_one_hot(observation: ObservationTable) -> bool:

@@ -48,9 +48,9 @@ class OnPolicy(Population):
 
     @property
     def outputs(self) -> tuple[Array, Array]:
-        """Logits (P, S, A) and values (P, S) of all states."""
+        """Logits (P, S, A) and values (P, S) of all states that are ever met."""
         if self._outputs is None:
-            logits, values = self.networks.run()
+            logits, values = self.networks.run_met()
             self._outputs = logits, values[..., 0]
         return self._outputs
 
@@ -65,6 +65,9 @@ class OnPolicy(Population):
 
     def snapshot(self, run: Run) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
         logits, values = self.outputs
+        if self.networks.kept is not None:
+            logits, values = self.networks.run()
+            values = values[..., 0]
         probabilities = torch.as_tensor(logits[run.row]).softmax(dim=-1).numpy()
         return values[run.row].astype(np.float64), probabilities.astype(np.float64), None
 
@@ -119,8 +122,9 @@ class OnPolicy(Population):
         self, pairs: IntArray, advantages: Array, returns: Array
     ) -> Iterator[tuple[IntArray | None, Sums]]:
         """The states to run the network on, None for all, and the sums there, of K minibatches (P, K, B)."""
-        if self.normalize_advantage and pairs.shape[-1] > 1:
-            advantages = normalized(advantages)
+        if self.normalize_advantage and pairs.shape[-1] > 1:  # as SB3 scales them
+            mean = advantages.mean(axis=-1, keepdims=True)
+            advantages = (advantages - mean) / (advantages.std(axis=-1, ddof=1, keepdims=True) + 1e-8)
         if self.num_states <= max(FEW_STATES, pairs.shape[-1]):
             sums = sum_up(pairs, advantages, returns, (self.num_states, self.num_actions))
             yield from ((None, sums.of(number)) for number in range(pairs.shape[1]))
@@ -157,7 +161,7 @@ class OnPolicy(Population):
         gamma = np.array([run.model.gamma for run in self.runs], dtype=np.float64)[:, None]
         row = (np.arange(len(self.runs)) * self.num_states)[:, None]
         visited = np.concatenate([rollout.pairs // self.num_actions, rollout.final_states[None]]) + row
-        following, at = values.take(rollout.last_states + row), values.take(visited)
+        following, at = values.take(rollout.reached + row), values.take(visited)
         rewards = (rollout.rewards + gamma * rollout.truncated * following).astype(np.float32)
         goes_on = 1 - (rollout.terminated | rollout.truncated).astype(np.float32)
         advantages = rewards + gamma.astype(np.float32) * at[1:] * goes_on - at[:-1]
@@ -211,28 +215,11 @@ class Sums:
         return Sums(*(getattr(self, name)[:, minibatch] for name in Sums.__slots__))
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Coefficients:
-    """The settings that the losses depend on, (P, 1, 1) each."""
-
-    clip_range: FloatArray
-    clip_range_vf: FloatArray | None
-    ent_coef: FloatArray
-    vf_coef: FloatArray
-
-
 def log_softmax(logits: Array) -> Array:
     """log π (..., A) of logits (..., A)."""
     shifted: Array = logits - logits.max(axis=-1, keepdims=True)
     shifted -= np.log(np.exp(shifted).sum(axis=-1, keepdims=True))
     return shifted
-
-
-def normalized(advantages: Array) -> Array:
-    """Advantages (..., B) with mean 0 and standard deviation 1, as SB3 scales them."""
-    mean = advantages.mean(axis=-1, keepdims=True)
-    scaled: Array = (advantages - mean) / (advantages.std(axis=-1, ddof=1, keepdims=True) + 1e-8)
-    return scaled
 
 
 def sum_up(pairs: IntArray, advantages: Array, returns: Array, shape: tuple[int, int]) -> Sums:
@@ -253,56 +240,43 @@ def sum_up(pairs: IntArray, advantages: Array, returns: Array, shape: tuple[int,
     return Sums(gains[..., 0], gains[..., 1], shares, states, mean, deviation / count)
 
 
-def slopes_of(
-    new: tuple[Array, Array], old: tuple[Array, Array], sums: Sums, coefficients: Coefficients
-) -> tuple[FloatArray, FloatArray]:
-    """Slopes of PPO's loss in the logits (P, U, A) and in the values (P, U), see above.
+def losses_and_slopes(
+    new: tuple[Array, Array],
+    old: tuple[Array, Array],
+    sums: Sums,
+    *,
+    clip_range: FloatArray,
+    ent_coef: FloatArray,
+    vf_coef: FloatArray,
+    clip_range_vf: FloatArray | None = None,
+) -> tuple[dict[str, FloatArray], FloatArray, FloatArray]:
+    """The numbers that SB3 logs, and the loss's slopes in the logits and in the values, see above.
 
-    `new` and `old` are log π (P, U, A) and values (P, U), of those that learn and those that collected.
+    `new` and `old` are log π (P, U, A) and values (P, U), of those that learn and those that collected;
+    settings are (P, 1, 1). Returns {name: (P,)}, (P, U, A) and (P, U). The divergence is http://joschu.net/blog/kl-approx.html.
     """
-    (log_prob, values), clip, clip_vf = new, coefficients.clip_range, coefficients.clip_range_vf
-    ratio, prob = np.exp(log_prob - old[0]), np.exp(log_prob)
+    (log_prob, values), clip, over = new, clip_range, (-2, -1)
+    log_ratio = log_prob - old[0]
+    ratio, prob = np.exp(log_ratio), np.exp(log_prob)
     low, high = (1 - clip).astype(np.float32), (1 + clip).astype(np.float32)  # as exact as the ratio
     slope = -ratio * (sums.positive * (ratio <= high) + sums.negative * (ratio >= low))
-    slope += coefficients.ent_coef * sums.states[..., None] * prob * (log_prob + 1)
+    slope += ent_coef * sums.states[..., None] * prob * (log_prob + 1)
     slope -= prob * slope.sum(axis=-1, keepdims=True)
-    moves: Array = (2 * coefficients.vf_coef[..., 0]).astype(np.float32)
-    if clip_vf is not None:
-        values, unclipped = _clipped_values(values, old[1], clip_vf[..., 0])
-        moves = moves * unclipped
-    return slope, moves * (sums.states * (values - sums.mean_return))
-
-
-def divergence(log_prob: Array, old: Array, pairs: FloatArray) -> FloatArray:
-    """The approximate KL divergence of minibatches, (...); http://joschu.net/blog/kl-approx.html."""
-    log_ratio = log_prob - old
-    return np.asarray((pairs * (np.exp(log_ratio) - 1 - log_ratio)).sum(axis=(-2, -1)))
-
-
-def losses_of(
-    new: tuple[Array, Array], old: tuple[Array, Array], sums: Sums, coefficients: Coefficients
-) -> dict[str, FloatArray]:
-    """The numbers that SB3 logs, (P,) each; arguments as for `slopes_of`."""
-    (log_prob, values), clip, over = new, coefficients.clip_range, (-2, -1)
-    ratio = np.exp(log_prob - old[0])
+    moves: Array = (2 * vf_coef[..., 0]).astype(np.float32)
+    if clip_range_vf is not None:
+        most, change = clip_range_vf[..., 0].astype(np.float32), values - old[1]
+        values, moves = old[1] + np.clip(change, -most, most), moves * (abs(change) <= most)
+    error = values - sums.mean_return
     gains = sums.positive * np.minimum(ratio, 1 + clip) + sums.negative * np.maximum(ratio, 1 - clip)
-    if coefficients.clip_range_vf is not None:
-        values, _ = _clipped_values(values, old[1], coefficients.clip_range_vf[..., 0])
     policy = -gains.sum(axis=over)
-    value = (sums.states * (values - sums.mean_return) ** 2).sum(axis=-1) + sums.deviation
-    entropy = (sums.states * (np.exp(log_prob) * log_prob).sum(axis=-1)).sum(axis=-1)
-    ent_coef, vf_coef = coefficients.ent_coef[:, 0, 0], coefficients.vf_coef[:, 0, 0]
-    return {
-        "loss": policy + ent_coef * entropy + vf_coef * value,
+    value = (sums.states * error**2).sum(axis=-1) + sums.deviation
+    entropy = (sums.states * (prob * log_prob).sum(axis=-1)).sum(axis=-1)
+    losses = {
+        "loss": policy + ent_coef[:, 0, 0] * entropy + vf_coef[:, 0, 0] * value,
         "policy_gradient_loss": policy,
         "value_loss": value,
         "entropy_loss": entropy,
-        "approx_kl": divergence(log_prob, old[0], sums.pairs),
+        "approx_kl": (sums.pairs * (ratio - 1 - log_ratio)).sum(axis=over),
         "clip_fraction": (sums.pairs * (abs(ratio - 1) > clip)).sum(axis=over),
     }
-
-
-def _clipped_values(values: Array, old: Array, most: FloatArray) -> tuple[Array, Array]:
-    """Values that have changed by no more than `most` (P, 1), and which of them have."""
-    most, change = most.astype(np.float32), values - old
-    return old + np.clip(change, -most, most), abs(change) <= most
+    return losses, slope, moves * (sums.states * error)

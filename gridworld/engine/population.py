@@ -11,11 +11,11 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gridworld.config.fields import Decay
 from gridworld.engine.environments import Environments
-from gridworld.engine.networks import DenseNetworks, Inputs, ModuleNetworks, Networks
+from gridworld.engine.networks import DenseNetworks, Networks, StateNetwork, make_networks
 from gridworld.engine.optimizer import Optimizer
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
@@ -39,24 +39,21 @@ class Run:
     """What one run of a population has to itself, besides its row of the arrays."""
 
     model: Any  # SB3's own, for settings, counters and the names of logged values; its weights are stale
-    parameters: Sequence[nn.Parameter]  # of its network, in the order of its optimiser and of a row
-    inputs: Inputs  # what the network sees of each state
-    nets: Sequence[Sequence[nn.Module]]  # the layers of each output
+    network: StateNetwork
+    target: StateNetwork | None  # where it has a target network
     envs: StatisticsVectorEnv  # for their generator and their statistics
     torch_generator: torch.Generator  # in place of torch's own
     numpy_generator: np.random.RandomState  # in place of numpy's own
     reward_scale: float = 1.0  # that rewards are multiplied by
     falling: Mapping[str, Decay] = field(default_factory=dict)  # settings that fall as SB3 lets none fall
     log_interval: int = 1  # as SB3's `learn` takes it
-    target: Inputs | None = None  # what its target network sees of each state, where it has one
-    target_parameters: Sequence[nn.Parameter] = ()  # of that, in the same order
     counts_transitions: bool = False  # whether its replay counts transitions
     shape: Hashable = None  # what runs of one population have in common of their settings
     population: Population = field(init=False, repr=False)
     row: int = field(init=False, default=0)
     total_timesteps: int = field(init=False, default=0)
     next_call: int = field(init=False, default=0)  # the steps by which `on_step` wants to be called
-    on_step: Callable[[int], int] = field(init=False, default_factory=lambda: lambda steps: steps + 1)
+    on_step: Callable[[int], int] | None = field(init=False, default=None)
     on_safe_point: Callable[[int], None] | None = field(init=False, default=None)
     error: BaseException | None = field(init=False, default=None)  # that it ended with
     has_ended: bool = field(init=False, default=False)  # before its last step
@@ -96,7 +93,7 @@ class Run:
         """Call what wants to be called after these steps of the run; it may end the run."""
         self.model.num_timesteps = steps
         try:
-            self.next_call = self.on_step(steps)
+            self.next_call = steps + 1 if self.on_step is None else self.on_step(steps)
         except BaseException as error:
             self.fail(error)
         else:
@@ -209,19 +206,19 @@ class Population:
     def kind(cls, run: Run) -> Hashable:
         """Equal for runs that can form a population; of runs in large worlds each is of its own kind."""
         model, envs, mdp = run.model, run.envs, run.envs.mdp
-        fits = mdp.num_states <= FEW_STATES and DenseNetworks.fit(run.nets, run.parameters)
+        fits = mdp.num_states <= FEW_STATES and DenseNetworks.fit(run.network)
         if not fits or not (model.device.type == "cpu" or mixed()):
             return id(run)
         return (
             *(cls, run.shape, mdp.digest(), envs.num_envs, envs.step_limit, envs.stratified),
-            *(repr(model.policy), str(model.device), run.reward_scale, run.inputs.digest()),
+            *(repr(model.policy), str(model.device), run.reward_scale, run.network.digest()),
             *(model.num_timesteps, run.total_timesteps),
         )
 
     @classmethod
     def networks_of(cls, runs: Sequence[Run]) -> list[Networks]:
         """The networks that runs learn with, as far as they differ in kind; the first acts."""
-        return [make_networks(runs)]
+        return [make_networks([run.network for run in runs], met_states(runs[0]))]
 
     def _optimizer(self) -> Optimizer:
         own = [run.model.policy.optimizer for run in self.runs]
@@ -257,11 +254,11 @@ class Population:
 
     def fitted(self, run: Run) -> Sequence[Tensor]:
         """The parameters of SB3's model that the optimiser steps on."""
-        return run.parameters
+        return run.network.parameters
 
     def weights(self, run: Run) -> dict[str, tuple[Networks, Sequence[Tensor]]]:
         """The networks that a run has a row of, by their names in a state, and SB3's parameters for it."""
-        return {"weights": (self.networks, run.parameters)}
+        return {"weights": (self.networks, run.network.parameters)}
 
     def snapshot(self, run: Run) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
         """What a run's network says of all states: values (S,), probabilities (S, A), Q (S, A), float64."""
@@ -271,19 +268,16 @@ class Population:
         """The population of the runs that have not ended, None if all have; the others are on their own."""
         if self.active.all():
             return self
-        self.environments.put_back()
-        going, make = self.active, type(self)
-        states = [self.get_state(run) for run in self.runs]
-        pairs = list(zip(self.runs, states, strict=True))
-        for run, state in pairs:
-            if not going[run.row]:
-                make([run], [state])
-        left = [pair for pair, goes in zip(pairs, going, strict=True) if goes]
-        return make(*map(list, zip(*left, strict=True))) if left else None
+        states, left = {run: self.get_state(run) for run in self.runs}, self.going()
+        for run in states:
+            if run.has_ended:
+                type(self)([run], [states[run]])
+        return type(self)(left, [states[run] for run in left]) if left else None
 
     def safe_point(self) -> Self | None:
         """Let all runs be saved, as nothing is half done; returns the population of those that go on."""
-        finite = [torch.isfinite(each.weights).all(dim=1).cpu().numpy() for each in self.all_networks]
+        sums = [each.weights.sum(dim=1) for each in self.all_networks]  # a third of what asking each costs
+        finite = [torch.isfinite(each).cpu().numpy() for each in sums]
         for run in self.going():
             if all(of_runs[run.row] for of_runs in finite):
                 run.safe_point(self.num_timesteps)
@@ -303,7 +297,7 @@ class Population:
             **run.get_state(),
             "optimizer": self.optimizer.get_state(run.row),
             **{
-                name: networks.weights[run.row].cpu().numpy().copy()
+                name: networks.whole()[run.row].cpu().numpy().copy()
                 for name, (networks, _) in self.weights(run).items()
             },
         }
@@ -311,9 +305,9 @@ class Population:
     def set_state(self, run: Run, state: State) -> None:
         run.set_state(state)
         for name, (networks, _) in self.weights(run).items():
-            own = networks.weights[run.row].cpu().numpy()
+            own = networks.whole()[run.row].cpu().numpy()
             fill(own, state[name], name)
-            networks.weights[run.row] = torch.as_tensor(own)
+            networks.set_row(run.row, torch.as_tensor(own))
         self.optimizer.set_state(run.row, state["optimizer"])
 
 
@@ -343,25 +337,24 @@ def train(runs: Sequence[Run], states: Sequence[State | None]) -> None:
                 for run in members:
                     if not run.has_ended:
                         run.error = run.failed_update = error
+    for run in runs:
+        run.on_step = run.on_safe_point = None  # which hold what holds the run
 
 
-def make_networks(
-    runs: Sequence[Run],
-    parameters: Callable[[Run], Sequence[nn.Parameter]] = lambda run: run.parameters,
-    outputs: slice = slice(None),
-    is_target: bool = False,
-) -> Networks:
-    """The networks of some runs, or their target networks, with the weights that SB3's models have."""
-    first, of_runs = runs[0], [parameters(run) for run in runs]
-    vectors = [torch.cat([each.detach().reshape(-1) for each in own]) for own in of_runs]
-    inputs, nets = (first.target if is_target else first.inputs), first.nets[outputs]
-    assert inputs is not None
-    table = inputs.table()
-    if DenseNetworks.fit(first.nets, first.parameters) and (inputs.is_look_up or table is not None):
-        own = first.parameters if is_target else of_runs[0]
-        return DenseNetworks(torch.stack(vectors), own, nets, table)
-    assert len(runs) == 1
-    return ModuleNetworks(vectors[0], of_runs[0], lambda states: inputs.forward(states)[outputs])
+def met_states(run: Run) -> IntArray | None:
+    """The states (U,) of a large world that a run can meet within its step limit; None if those are all.
+
+    Without weight decay, a first layer of unit vectors never changes in the columns of the others.
+    """
+    mdp, settings = run.envs.mdp, run.model.policy.optimizer.param_groups[0]
+    if mdp.num_states <= FEW_STATES or not run.network.is_look_up or settings.get("weight_decay"):
+        return None
+    found, front = mdp.start > 0, mdp.start_states
+    for _ in range(min(run.envs.step_limit, mdp.num_states)):
+        following = mdp.next_state[front][mdp.probability[front] > 0]
+        front = np.unique(following[~found[following]])
+        found[front] = True
+    return None if found.all() else np.flatnonzero(found)
 
 
 _agreed: dict[Hashable, bool] = {}  # by kind, number of runs and threads
@@ -380,8 +373,8 @@ def agree(runs: Sequence[Run]) -> bool:
         _agreed[key] = _try_out(runs)
         if not _agreed[key]:
             tell(
-                "population: this processor or torch adds up otherwise for several networks like these at "
-                "once; such runs train one by one"
+                "population: on this processor, networks like these get other bits when batched; such runs "
+                "train one by one"
             )
     return _agreed[key]
 

@@ -7,15 +7,7 @@ from collections.abc import Hashable, Iterator, Sequence
 import numpy as np
 
 from gridworld.engine.networks import Array
-from gridworld.engine.on_policy import (
-    Coefficients,
-    OnPolicy,
-    Sums,
-    divergence,
-    log_softmax,
-    losses_of,
-    slopes_of,
-)
+from gridworld.engine.on_policy import OnPolicy, Sums, log_softmax, losses_and_slopes
 from gridworld.engine.population import Run
 from gridworld.storage.serialization import State
 from gridworld.world.mdp import BoolArray, IntArray
@@ -36,12 +28,8 @@ class PPO(OnPolicy):
         return super().kind(run), run.model.clip_range_vf is None
 
     def update(self, old: tuple[Array, Array], pairs: IntArray, advantages: Array, returns: Array) -> None:
-        coefficients = Coefficients(
-            self.column("clip_range"),
-            self.column("clip_range_vf") if self.clips_values else None,
-            self.column("ent_coef"),
-            self.column("vf_coef"),
-        )
+        names = ["clip_range", "clip_range_vf"] if self.clips_values else ["clip_range"]
+        settings = {name: self.column(name) for name in (*names, "ent_coef", "vf_coef")}
         learning_rates = self.settings("learning_rate")
         active, whole = self.active.copy(), None  # those that have not ended their epochs
         log = _Log(len(self.runs))
@@ -59,17 +47,16 @@ class PPO(OnPolicy):
                 logits, values = self.networks.run(states)
                 new = log_softmax(logits), values[..., 0]
                 before = old if states is None else (old[0][:, states], old[1][:, states])
-                log.add(active, losses_of(new, before, sums, coefficients))
+                losses, of_logits, of_values = losses_and_slopes(new, before, sums, **settings)
+                log.add(active, losses)
                 if self.most_divergence is not None:
-                    active &= divergence(new[0], before[0], sums.pairs) <= self.most_divergence
-                slopes = slopes_of(new, before, sums, coefficients)
-                self.networks.backward(slopes[0], slopes[1][..., None])
+                    active &= losses["approx_kl"] <= self.most_divergence
+                self.networks.backward(of_logits, of_values[..., None])
                 finite = self.optimizer.step(learning_rates, active)
                 self.check(finite | ~active, "the gradient")
                 active &= finite
         means = log.means()
-        names = ["clip_range", "clip_range_vf"] if self.clips_values else ["clip_range"]
-        means |= {name: np.array(self.settings(name)) for name in names}
+        means |= {name: settings[name][:, 0, 0] for name in names}
         for run in self.going():
             run.model._n_updates += int(log.epochs[run.row])
             for name, mean in means.items():
@@ -92,12 +79,17 @@ class _Log:
     def means(self) -> dict[str, Array]:
         """(P,) each; SB3 has the divergence of the last epoch, and the loss of the last minibatch."""
         epoch = np.stack(self._epoch, axis=1)
-        taken, last = epoch > 0, epoch == epoch.max(axis=1, keepdims=True)
+        last = epoch == epoch.max(axis=1, keepdims=True)
+        steps = (epoch > 0).sum(axis=1)  # of each run, its first ones
         found = {}
         for name in self._losses[0]:
-            losses = np.stack([each[name] for each in self._losses], axis=1)
-            chosen = last if name == "approx_kl" else taken
-            if name == "loss":
-                chosen = np.arange(epoch.shape[1]) == taken.sum(axis=1, keepdims=True) - 1
-            found[name] = np.where(chosen, losses, 0).sum(axis=1) / np.maximum(chosen.sum(axis=1), 1)
+            losses, means = np.stack([each[name] for each in self._losses], axis=1), np.zeros(len(steps))
+            for count in np.unique(steps):  # apart, since how numpy adds up depends on how many there are
+                rows, own = steps == count, slice(count)
+                chosen = last[rows, own] if name == "approx_kl" else np.ones_like(last[rows, own])
+                if name == "loss":
+                    chosen[:, :-1] = False
+                added = np.where(chosen, losses[rows, own], 0).sum(axis=1)
+                means[rows] = added / np.maximum(chosen.sum(axis=1), 1)
+            found[name] = means
         return found

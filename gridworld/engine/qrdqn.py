@@ -29,8 +29,7 @@ class QRDQN(DQN):
 
     @staticmethod
     def q_of(outputs: Array) -> Array:
-        q: Array = torch.as_tensor(outputs).mean(dim=-2).numpy()
-        return q
+        return torch.as_tensor(outputs).mean(dim=-2).numpy()
 
     @staticmethod
     def of_best_action(outputs: Array) -> Array:
@@ -45,8 +44,7 @@ class QRDQN(DQN):
         )
         values = following.transpose(2, 0, 1, 3)
         discounts = ((1 - drawn.ends) * gamma)[:, :, None]
-        targets: Array = drawn.rewards[:, :, None] + discounts * values
-        return targets
+        return drawn.rewards[:, :, None] + discounts * values
 
     @staticmethod
     def losses_and_slopes(
@@ -80,5 +78,4 @@ def quantile_loss(quantiles: Array, targets: Array) -> tuple[float, Array]:
 
 def _weighed(level: Array, all_of_it: Array, above: Array) -> Array:
     """Sums over targets, weighed by |τ - (δ < 0)|, of the sums over all and over those above the quantile."""
-    weighed: Array = level * above + (1 - level) * (all_of_it - above)
-    return weighed
+    return level * above + (1 - level) * (all_of_it - above)

@@ -163,7 +163,9 @@ class CountedReplay:
         most = self._num_states * self._num_actions * self._num_states * 2
         is_sorted = np.isfinite(met).all() and np.array_equal(np.unique(met), met)
         if not (is_sorted and (met.real >= 0).all() and (met.real < most).all() and (counts > 0).all()):
-            raise StateError("transitions must be numbers of this world's, ascending, with their counts")
+            raise StateError(
+                "transitions must be ascending transition numbers of this world, with their counts"
+            )
         self._met[run], self._counts[run] = met, counts
 
 
@@ -186,5 +188,4 @@ def systematic_sample(counts: IntArray, size: int, chance: FloatArray) -> IntArr
     ends = np.cumsum(counts)
     before = np.ceil(size * (ends / ends[-1]) - chance[:, None])  # points before each end
     before[:, -1] = size  # whatever was rounded
-    times: IntArray = np.diff(before, prepend=0).astype(np.int64)
-    return times
+    return np.diff(before, prepend=0).astype(np.int64)

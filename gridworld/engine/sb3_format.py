@@ -6,6 +6,7 @@ import importlib
 import io
 import pkgutil
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,13 @@ from stable_baselines3.common.utils import FloatSchedule
 from torch import nn
 
 import gridworld.engine
-from gridworld.engine.networks import Inputs, copy_row, cut
+from gridworld.engine.networks import StateNetwork, cut
 from gridworld.engine.population import Population, Run
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.storage.serialization import independent_generator
+
+Parameters = Sequence[nn.Parameter]
 
 
 def algorithm_of(model_class: type[BaseAlgorithm]) -> type[Population] | None:
@@ -31,8 +34,7 @@ def algorithm_of(model_class: type[BaseAlgorithm]) -> type[Population] | None:
     if library not in ("stable_baselines3", "sb3_contrib") or name not in known:
         return None
     module = importlib.import_module(f"gridworld.engine.{name}")
-    found: type[Population] | None = getattr(module, model_class.__name__, None)
-    return found
+    return getattr(module, model_class.__name__, None)
 
 
 def make_run(
@@ -52,34 +54,34 @@ def make_run(
     envs.np_random = independent_generator(seed)
     envs.reset()
     policy: Any = model.policy
-    nets, inputs = _inputs(policy, observation)
-    parameters = policy.optimizer.param_groups[0]["params"]
-    run = Run(model, parameters, inputs, nets, envs, torch_generator, numpy_generator, **options)
-    for name in ("q_net_target", "quantile_net_target"):
-        if hasattr(policy, name):
-            _, run.target = _inputs(policy, observation, getattr(policy, name))
-            run.target_parameters = list(getattr(policy, name).parameters())
-    return run
-
-
-def _inputs(
-    policy: Any, observation: ObservationTable, network: Any = None
-) -> tuple[Sequence[Sequence[nn.Module]], Inputs]:
-    """The layers of each output, and what feeds them; `network`: None for the policy's own."""
+    parameters, target = policy.optimizer.param_groups[0]["params"], None
     if isinstance(policy, ActorCriticPolicy):
-        own = policy.mlp_extractor
-        nets = [[*own.policy_net, policy.action_net], [*own.value_net, policy.value_net]]
-        names = ["features_extractor"]
-        if not policy.share_features_extractor:
-            names = ["pi_features_extractor", "vf_features_extractor"]
-        extractors = [getattr(policy, name) for name in names]
-        return nets, Inputs(policy, observation, nets, extractors, policy.extract_features)
-    network = network or (policy.q_net if hasattr(policy, "q_net") else policy.quantile_net)
-    nets = [[*(network.q_net if hasattr(network, "q_net") else network.quantile_net)]]
-    extractor = network.features_extractor
-    return nets, Inputs(
-        policy, observation, nets, [extractor], lambda rows: network.extract_features(rows, extractor)
-    )
+        network = _actor_critic(policy, observation, parameters)
+    else:
+        name = "q_net" if hasattr(policy, "q_net") else "quantile_net"
+        network = _value_network(policy, observation, name, parameters)
+        own = list(getattr(policy, f"{name}_target").parameters())
+        target = _value_network(policy, observation, f"{name}_target", own)
+    return Run(model, network, target, envs, torch_generator, numpy_generator, **options)
+
+
+def _actor_critic(policy: Any, observation: ObservationTable, parameters: Parameters) -> StateNetwork:
+    own = policy.mlp_extractor
+    layers = [[*own.policy_net, policy.action_net], [*own.value_net, policy.value_net]]
+    names = ["features_extractor"]
+    if not policy.share_features_extractor:
+        names = ["pi_features_extractor", "vf_features_extractor"]
+    extractors = [getattr(policy, name) for name in names]
+    return StateNetwork(policy, observation, layers, parameters, extractors, policy.extract_features)
+
+
+def _value_network(
+    policy: Any, observation: ObservationTable, name: str, parameters: Parameters
+) -> StateNetwork:
+    own = getattr(policy, name)
+    layers, extractor = [[*getattr(own, name.removesuffix("_target"))]], own.features_extractor
+    extract = partial(own.extract_features, features_extractor=extractor)
+    return StateNetwork(policy, observation, layers, parameters, [extractor], extract)
 
 
 def put_weights(run: Run) -> None:
@@ -94,10 +96,13 @@ def put_weights(run: Run) -> None:
             setattr(model, name, value)
     optimizer.param_groups[0]["lr"] = run.setting("learning_rate", progress)
     for networks, parameters in population.weights(run).values():
-        copy_row(networks.weights[run.row], parameters)
+        parts = cut(networks.whole()[run.row], [parameter.shape for parameter in parameters])
+        for parameter, part in zip(parameters, parts, strict=True):
+            parameter.data.copy_(part)  # which may be a view of the row, and leaves a graph as it is
     shapes = [parameter.shape for parameter in population.fitted(run)]
     state = {name: torch.as_tensor(value) for name, value in population.optimizer.get_state(run.row).items()}
-    cuts = {name: cut(value, shapes) for name, value in state.items() if value.dim()}
+    spread = population.networks.spread
+    cuts = {name: cut(spread(value), shapes) for name, value in state.items() if value.dim()}
     for number, parameter in enumerate(population.fitted(run) if state else ()):
         optimizer.state[parameter] = {
             name: (cuts[name][number] if name in cuts else value).to(

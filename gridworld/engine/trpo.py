@@ -28,10 +28,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gridworld.engine.networks import Array, Networks, aligned
+from gridworld.engine.networks import Array, Networks, aligned, make_networks
 from gridworld.engine.on_policy import OnPolicy, Sums, log_softmax
 from gridworld.engine.optimizer import Optimizer
-from gridworld.engine.population import Run, diverged, make_networks
+from gridworld.engine.population import Run, diverged
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 _OF_VALUES = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")  # parameters of these alone
@@ -44,8 +44,9 @@ class TRPO(OnPolicy):
     @classmethod
     def networks_of(cls, runs: Sequence[Run]) -> list[Networks]:
         """See `Population.networks_of`: those of the policies, and those of the values."""
-        policies = make_networks(runs, policy_parameters, slice(0, 1))
-        return [policies, make_networks(runs, value_parameters, slice(1, 2))]
+        actors = [run.network.part(slice(0, 1), policy_parameters(run)) for run in runs]
+        critics = [run.network.part(slice(1, 2), value_parameters(run)) for run in runs]
+        return [make_networks(actors), make_networks(critics)]
 
     def _optimizer(self) -> Optimizer:
         self.critic = self.all_networks[1]  # the networks of the values

@@ -94,7 +94,7 @@ class GridWorldEnv(gym.Env[int, int]):
             raise InputError(f"mdp={world.name}: has no map; a batch of it is GridWorldVectorEnv(mdp=...)")
         if (world.thresholds != world.thresholds[0, 0]).any():
             raise InputError(
-                f"mdp={world.name}: slips otherwise in some cells; give GridWorldVectorEnv(mdp=...)"
+                f"mdp={world.name}: slips differently in some cells; use GridWorldVectorEnv(mdp=...)"
             )
         self._mdp: GridMdp = world
         self._thresholds: tuple[float, ...] = tuple(world.thresholds[0, 0].tolist())  # of all cells and moves
@@ -211,8 +211,8 @@ class GridWorldEnv(gym.Env[int, int]):
         if self.window is None and not drawing.has_display():
             # A log line and no exception: SDL then draws off screen, where every call still works.
             _log.warning(
-                "human mode found no display, so its window cannot be seen; "
-                "set DISPLAY, or use render_mode='rgb_array'"
+                "there is no display, so the window of render_mode='human' is invisible; set DISPLAY, or "
+                "use 'rgb_array'"
             )
         size = drawing.frame_size(self.mdp, self.cell_size)
         pygame.display.init()  # not pygame.init(), which would look for a sound card too
@@ -252,7 +252,7 @@ class GridWorldEnv(gym.Env[int, int]):
             colour: Colour = drawing.GOAL if len(coords_list) == 3 else drawing.AGENT
             draw.polygon(screen, colour, list(coords_list))
         else:
-            raise InputError(f"coords_list: {len(coords_list)} points make no shape; give 1, 3 or more")
+            raise InputError(f"coords_list: {len(coords_list)} points are not a shape; give 1, 3 or more")
 
 
 def _whole_number(value: Any) -> int:

@@ -111,8 +111,8 @@ def _task(env: Any) -> Task:
 
 def _no_world(env: Any) -> InputError:
     return InputError(
-        f"env: {type(env).__name__} has no GridWorld in it and no transition table; must be a GridWorld "
-        "environment, one of Gymnasium with a table P, a compiled world, or the name of a world"
+        f"env: {type(env).__name__} contains neither a GridWorld nor a transition table; must be a "
+        "GridWorld environment, a Gymnasium one with a table P, a compiled world, or a world's name"
     )
 
 
@@ -122,15 +122,15 @@ def _single(env: gym.Env[Any, Any]) -> Task:
     mdp = getattr(real, "mdp", None)
     if real is not innermost or not isinstance(real, gym.Env):
         raise InputError(
-            f"env: {type(innermost).__name__} replaces {type(real).__name__} and may do anything "
-            "with its steps, so nothing exact is known of it; make it a gymnasium.Wrapper"
+            f"env: {type(innermost).__name__} replaces {type(real).__name__} and may change its steps, so "
+            "it cannot be solved exactly; make it a gymnasium.Wrapper"
         )
     if isinstance(mdp, GridMdp):
         methods = (*STEPPED_BY, "mdp", "np_random")
         if known_class(real, {"gridworld.envs.env:GridWorldEnv": _NATIVE}, methods) is None:
             raise InputError(
-                f"env: {type(real).__name__} has its own step() or reset(), so it may be another task than "
-                "its map says; leave them as they are in GridWorldEnv, or wrap it"
+                f"env: {type(real).__name__} has its own step() or reset(), so its task may differ from its "
+                "map; leave them as in GridWorldEnv, or wrap it"
             )
         verified(mdp, "env")
     elif has_table(real):
@@ -166,11 +166,11 @@ def _stacked(observations: list[Any], space: gym.Space[Any]) -> Any:
         given = np.stack([np.asarray(each) for each in observations])
         rows = given.astype(space.dtype)
     except (TypeError, ValueError):
-        raise InputError(f"env: its observations are not arrays of {space}, as its space says") from None
+        raise InputError(f"env: its observations are not arrays of its space, {space}") from None
     if not np.allclose(rows.astype(np.float64), given.astype(np.float64), rtol=1e-3, atol=1e-6):
         raise InputError(
-            f"env: its observations are {given.dtype}, and others as {space.dtype}, which its space says and "
-            "a batch makes of them; give the space the right dtype"
+            f"env: its observations are {given.dtype}, but its space says {space.dtype}, and a batch "
+            "converts them; correct the dtype of the space"
         )
     return rows
 
@@ -180,8 +180,7 @@ def _copies(batch: Any) -> Task:
     first, *others = batch.envs
     if len({id(each.unwrapped) for each in batch.envs}) < len(batch.envs):
         raise InputError(
-            f"env: the {type(batch).__name__} has the same environment twice, so that each step of one is a "
-            "step of the other; make one for each"
+            f"env: the {type(batch).__name__} contains the same environment twice; make a new one for each"
         )
     task = _single(first)
     tasks = {index: _single(other) for index, other in enumerate(others, 1)}
@@ -191,7 +190,7 @@ def _copies(batch: Any) -> Task:
             if not is_same(other):
                 raise InputError(
                     f"env: environment {index} of the {type(batch).__name__} {mistake} environment 0; give "
-                    "one of them, or a batch of one task"
+                    "one of them, or a batch with a single task"
                 )
 
     def seen() -> ObservationTable:
@@ -201,17 +200,17 @@ def _copies(batch: Any) -> Task:
             theirs = other.seen()  # type: ignore[misc]
             return table.space == theirs.space and same(_rows(table), _rows(theirs))
 
-        refuse_others(shows_the_same, "shows states otherwise than")
+        refuse_others(shows_the_same, "shows states differently from")
         return table
 
     def masks() -> NDArray[np.bool_] | None:
         mine: Any = task.masks()
-        refuse_others(lambda other: np.array_equal(mine, other.masks()), "masks actions otherwise than")  # type: ignore[arg-type]
-        return mine  # type: ignore[no-any-return]
+        refuse_others(lambda other: np.array_equal(mine, other.masks()), "masks actions differently from")  # type: ignore[arg-type]
+        return mine
 
     text, limit = Mdp.text(task.mdp), task.own_limit
     refuse_others(
-        lambda other: (Mdp.text(other.mdp), other.own_limit) == (text, limit), "is another task than"
+        lambda other: (Mdp.text(other.mdp), other.own_limit) == (text, limit), "is a different task from"
     )
     return replace(task, seen=functools.cache(seen), masks=masks)
 
@@ -225,13 +224,13 @@ def _batch(env: Any) -> Task:
     kind, name = known_class(env, _BATCHES, (*_DECISIVE, *of_wrapper)), type(env).__name__
     if kind is None:
         raise InputError(
-            f"env: {name} is not a batch or a wrapper of one whose effect on the task is known, so nothing "
-            "exact is known of what is in it; leave it out, or give one environment as env=..."
+            f"env: {name} is not a known batch or batch wrapper, so what it does to the task is unknown; "
+            "leave it out, or give a single environment as env=..."
         )
     if kind == _PROCESSES:
         raise InputError(
-            f"env: {name} has its environments in other processes, where their wrappers cannot be looked at; "
-            "give one environment, made as they are, as env=..."
+            f"env: {name} runs its environments in other processes, where their wrappers cannot be "
+            "inspected; give one such environment as env=..."
         )
     if kind == _COPIES:
         return _copies(env)
@@ -250,7 +249,7 @@ def _batch(env: Any) -> Task:
     def seen() -> ObservationTable:
         if kind not in _BY_METHOD:
             raise InputError(
-                f"env: {name} makes observations of more than the state, so no table of the policy can be "
+                f"env: {name} makes observations that depend on more than the state, so no policy can be "
                 "evaluated exactly; leave it out"
             )
         assert below.seen is not None
@@ -279,6 +278,6 @@ def observation_like(mdp: Mdp, space: gym.Space[Any]) -> ObservationTable:
         if table.space == space:
             return table
     raise InputError(
-        f"the model sees {space}, and no observation of this world ({mdp.num_states} states) is like that; "
-        f"give the environment that it was trained on, or train on one of {', '.join(KINDS)}"
+        f"the model expects {space}, which no observation of this world ({mdp.num_states} states) has; give "
+        f"the environment that it was trained on, or train on one of {', '.join(KINDS)}"
     )

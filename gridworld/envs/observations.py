@@ -81,7 +81,7 @@ def _one_hot(mdp: Mdp, cell_size: int) -> Rows:
 def _places(mdp: Mdp, kind: str) -> IntArray:
     if mdp.places is None:
         raise InputError(
-            f"observation {kind}: the states of {mdp.name} have no places; take another observation"
+            f"observation {kind}: the states of {mdp.name} have no coordinates; use another observation"
         )
     return mdp.places
 
@@ -103,7 +103,7 @@ def _image(mdp: Mdp, cell_size: int) -> Rows:
     if size > _MAX_TABLE_BYTES:
         raise InputError(
             f"observation image: {mdp.num_states} frames of {width} x {height} pixels take "
-            f"{size / 2**30:.1f} GiB, more than 1; take a cell_size below {cell_size} or another observation"
+            f"{size / 2**30:.1f} GiB, more than 1; use a cell_size below {cell_size} or another observation"
         )
     check_memory(f"observation image, cells of {cell_size} pixels", size + _OF_A_FRAME * 3 * width * height)
     pixels = np.empty((mdp.num_states, 3, height, width), dtype=np.uint8)
@@ -117,7 +117,7 @@ def _own(mdp: Mdp, cell_size: int) -> Rows:
     table = mdp.own_observation
     if table is None:
         raise InputError(
-            f"observation own: {mdp.name} has no observation of its own as an array; take another observation"
+            f"observation own: {mdp.name} has no array observation of its own; use another observation"
         )
     if table.ndim == 1 and table.dtype.kind in "iu":
         return spaces.Discrete(int(table.max()) + 1), table.astype(np.int64)

@@ -105,6 +105,12 @@ class Board:
         shown[self.state[self.kind == Kind.FLOOR]] = True
         return frozen(shown)
 
+    def summed(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Numbers (S,), those of states in one cell added up: all of these have the sum."""
+        has_place, totals = self.cell[:, 0] >= 0, np.zeros(self.state.shape, numbers.dtype)
+        np.add.at(totals, tuple(self.cell[has_place].T), numbers[has_place])
+        return np.where(has_place, totals[tuple(self.cell.T)], numbers)
+
 
 _boards: WeakKeyDictionary[Mdp, Board] = WeakKeyDictionary()
 
@@ -177,7 +183,7 @@ def frame_size(mdp: Mdp, cell_size: int = CELL_SIZE) -> tuple[int, int]:
     board = board_of(mdp)
     width, height = (board.cols + 2) * cell_size, (board.rows + 2) * cell_size
     if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
-        remedy = f"; take a cell_size below {cell_size}" if cell_size > 1 else ""
+        remedy = f"; use a cell_size below {cell_size}" if cell_size > 1 else ""
         world = f"layout {mdp.name}" if isinstance(mdp, GridMdp) else mdp.name
         raise InputError(f"{world}: a frame of {width} x {height} pixels is too large to draw{remedy}")
     return width, height

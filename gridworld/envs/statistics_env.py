@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from gridworld.envs.vector_env import Advance, GridWorldVectorEnv
+from gridworld.envs.vector_env import GridWorldVectorEnv, StateArray, Step
 from gridworld.storage.serialization import State, fill
 from gridworld.world.mdp import FloatArray
 
@@ -55,15 +55,11 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
         self._flat_visits = self.visits.reshape(-1)
         self._ended = NO_EPISODES  # since they were last taken
 
-    def advance(self, actions: NDArray[Any]) -> Advance:
-        """See `GridWorldVectorEnv.advance`."""
-        pairs = self._state * self.mdp.num_actions
-        step = super().advance(actions)
-        _, rewards, *_, ended = step
-        np.add(pairs, actions, out=pairs, casting="unsafe")  # unsigned ones too
-        self.count(pairs[None], rewards[None])
-        if ended is not None:
-            self._add_returns([ended.returns])
+    def _advance(self, pairs: StateArray) -> Step:
+        step = super()._advance(pairs)
+        self.count(pairs[None], step.rewards[None])
+        if step.which.size:
+            self._add_returns([step.returns])
         return step
 
     def count(self, pairs: NDArray[Any], rewards: FloatArray) -> None:

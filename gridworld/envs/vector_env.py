@@ -25,31 +25,23 @@ from gridworld.world.layout import CLASSIC, NUM_COLS, NUM_ROWS, Layout, positive
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 _RADIX_SORTED = 2**16  # numpy sorts numbers below it in linear time, if they are stored as such
+_NOWHERE, _NO_RETURNS = np.empty(0, dtype=np.intp), np.empty(0)
 
 StateArray = NDArray[np.int64]
-Step = tuple[StateArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]
 
 
-class Ended(NamedTuple):
-    """The n >= 1 episodes that a step of a batch ended, where the batch resets in the same step."""
+class Step(NamedTuple):
+    """A step of a batch, (num_envs,) each, and the m episodes that ended where it resets in the same step."""
 
-    states: StateArray  # (num_envs,), where the step led to, before the reset
-    mask: BoolArray  # (num_envs,), True where an episode ended
-    which: NDArray[np.intp]  # (n,), where the mask is True, ascending
-    returns: FloatArray  # (n,), undiscounted sums of rewards
-    lengths: NDArray[np.int64]  # (n,), steps
-
-
-class Tables(NamedTuple):
-    """A world's tables, flat: by (state * A + action) * K + outcome."""
-
-    next_state: StateArray
-    reward: FloatArray
+    states: StateArray  # the current ones
+    rewards: FloatArray
     terminated: BoolArray
-    thresholds: FloatArray  # (K - 1, S * A)
-
-
-Advance = tuple[StateArray, FloatArray, BoolArray, BoolArray, Ended | None]
+    truncated: BoolArray  # at the step limit
+    pairs: StateArray  # state * A + action, where it began
+    reached: StateArray  # where it led to, before the reset
+    which: NDArray[np.intp]  # (m,), ascending, where the episodes ended
+    returns: FloatArray  # (m,), undiscounted sums of rewards
+    lengths: NDArray[np.int64]  # (m,), steps
 
 
 class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
@@ -100,7 +92,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         stratified: bool = False,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
-            raise InputError(f"render_mode={render_mode!r}: a batch can be drawn as rgb_array only (or None)")
+            raise InputError(f"render_mode={render_mode!r}: a batch can only be drawn as rgb_array (or None)")
         try:
             self._autoreset = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -125,18 +117,17 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
+        # The world's tables, flat: by (state * A + action) * K + outcome; thresholds are (K - 1, S * A).
         # States are in numpy's own index type: smaller ones save nothing that counts and are converted at
         # every look-up.
         num_states, self._num_actions, self._num_outcomes = self.mdp.next_state.shape
-        next_state = self.mdp.next_state.ravel().astype(np.int64)
+        self._next_state, self._reward = self.mdp.next_state.ravel().astype(np.int64), self.mdp.reward.ravel()
+        self._terminated = self.mdp.terminal[self._next_state]
         thresholds = self.mdp.thresholds.reshape(num_states * self._num_actions, -1)
-        terminated = self.mdp.terminal[next_state]
-        self.tables = Tables(
-            next_state, self.mdp.reward.ravel(), terminated, np.ascontiguousarray(thresholds.T)
-        )
+        self._thresholds = np.ascontiguousarray(thresholds.T)
         self._state: StateArray = np.full(self.num_envs, self.mdp.start_states[0], dtype=np.int64)
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)  # steps of the episodes under way
-        self._returns = np.zeros(self.num_envs)  # of these, undiscounted; counted where `ended` tells them
+        self._returns = np.zeros(self.num_envs)  # of these, undiscounted; where it resets in the same step
         self._over = np.zeros(self.num_envs, dtype=np.bool_)  # waiting for the reset of their next step
 
     @property
@@ -159,9 +150,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
             options: `reset_mask`, (num_envs,) booleans, says which environments; without it, all.
         """
         if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int | np.integer)):
-            raise InputError(
-                f"seed={seed!r}: must be one whole number; all environments draw from one generator"
-            )
+            raise InputError(f"seed={seed!r}: must be one whole number; all environments share one generator")
         super().reset(seed=None if seed is None else int(seed))
         mask = (options or {}).get("reset_mask")
         if mask is None:
@@ -178,32 +167,33 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         self._over[which] = False
         return self._state.copy(), {}
 
-    def step(self, actions: NDArray[Any]) -> Step:
+    def step(
+        self, actions: NDArray[Any]
+    ) -> tuple[StateArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Move all environments once, by integer actions (num_envs,).
 
         Returns:
             (num_envs,) states (int64), rewards (float64), terminated and truncated (bool), and infos.
         """
-        states, rewards, terminated, truncated, ended = self.advance(actions)
+        step = self.advance(actions)
         infos: dict[str, Any] = {}
-        if ended is not None:  # as `SyncVectorEnv` has them for environments without infos of their own
-            final_obs = np.full(self.num_envs, None, dtype=object)
-            final_obs[ended.mask] = ended.states[ended.mask].tolist()  # plain ints, as of one environment
-            infos = {"final_obs": final_obs, "_final_obs": ended.mask}
-            infos |= {"final_info": {}, "_final_info": ended.mask.copy()}
-        return states, rewards, terminated, truncated, infos
+        if step.which.size:  # as `SyncVectorEnv` has them for environments without infos of their own
+            mask, final_obs = step.terminated | step.truncated, np.full(self.num_envs, None, dtype=object)
+            final_obs[mask] = step.reached[mask].tolist()  # plain ints, as of one environment
+            infos = {"final_obs": final_obs, "_final_obs": mask, "final_info": {}, "_final_info": mask.copy()}
+        return step.states, step.rewards, step.terminated, step.truncated, infos
 
-    def advance(self, actions: NDArray[Any]) -> Advance:
-        """`step` in arrays alone, for training; where it resets in the same step, with what ended."""
-        tables, index = self.tables, self._state * self._num_actions
-        index += self._check_actions(actions)
-        starting = np.flatnonzero(self._over)
+    def advance(self, actions: NDArray[Any]) -> Step:
+        """`step` in arrays alone, for training."""
+        return self._advance(self._state * self._num_actions + self._check_actions(actions))
+
+    def _advance(self, pairs: StateArray) -> Step:
+        starting, index = np.flatnonzero(self._over), pairs
         if self._num_outcomes > 1:
-            outcomes = self._draw_outcomes(index, starting)
-            index *= self._num_outcomes
-            index += outcomes
-        state, rewards = tables.next_state.take(index), tables.reward.take(index)
-        terminated = tables.terminated.take(index)
+            index = pairs * self._num_outcomes
+            index += self._draw_outcomes(pairs, starting)
+        state, rewards = self._next_state.take(index), self._reward.take(index)
+        terminated = self._terminated.take(index)
         self._state = state
         self._elapsed += 1
         if starting.size:
@@ -211,19 +201,19 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
             rewards[starting] = 0.0
             terminated[starting] = False
         truncated = self._elapsed >= self.step_limit
-        over = terminated | truncated
-        ended = None
+        over, which, returns, lengths = terminated | truncated, _NOWHERE, _NO_RETURNS, _NOWHERE
         if self._autoreset is AutoresetMode.SAME_STEP:
             self._returns += rewards
             which = np.flatnonzero(over)
             if which.size:
-                ended = Ended(state, over, which, self._returns[which], self._elapsed[which])
+                returns, lengths = self._returns.take(which), self._elapsed.take(which)
                 self._state = state.copy()
                 self._restart(which)
                 self._returns[which] = 0.0
         elif self._autoreset is AutoresetMode.NEXT_STEP:
             self._over = over
-        return self._state.copy(), rewards, terminated, truncated, ended
+        states = self._state.copy()
+        return Step(states, rewards, terminated, truncated, pairs, state, which, returns, lengths)
 
     def render(self) -> tuple[Frame, ...] | None:
         """One fresh frame (height, width, 3), uint8, per environment; None without a render mode."""
@@ -259,31 +249,31 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         """Mirrors `episode_state`."""
         self._state, self._elapsed, self._returns = states.copy(), elapsed.copy(), returns.copy()
 
-    def draw_starts(self, count: int) -> Any:
-        """The states in which so many new episodes begin, (count,), or the one in which all do."""
-        starts = self.mdp.start_states
-        if len(starts) == 1:
-            return starts[0]
-        return starts[self.mdp.start_index(self.draw_numbers(np.zeros(count, dtype=np.int64)))]
+    def draw_numbers(self, which: NDArray[np.intp], situations: StateArray) -> FloatArray:
+        """(n,) numbers from [0, 1) for these environments (n,), ascending.
 
-    def draw_numbers(self, situations: StateArray) -> FloatArray:
-        """(n,) numbers from [0, 1); if stratified, evenly spread in each of the `situations` (n,)."""
+        If stratified, they are evenly spread in each of the `situations` (n,).
+        """
         if self.stratified:
             return stratified_numbers(situations, self.np_random)
         return self.np_random.random(len(situations))
 
     def _restart(self, which: NDArray[np.intp]) -> None:
-        self._state[which] = self.draw_starts(len(which))
+        starts: Any = self.mdp.start_states
+        if len(starts) > 1:
+            starts = starts[self.mdp.start_index(self.draw_numbers(which, np.zeros_like(which)))]
+        self._state[which] = starts
         self._elapsed[which] = 0
 
     def _draw_outcomes(self, pairs: NDArray[np.int64], starting: NDArray[np.intp]) -> NDArray[np.int64]:
         """(num_envs,) outcomes of states and actions; who ended or starts anew draws nothing."""
-        still = self.mdp.terminal[self._state]
+        still = self.mdp.terminal.take(self._state)
         still[starting] = True
         moving = np.flatnonzero(~still)
-        draws = self.draw_numbers(pairs[moving])
+        situations = pairs[moving]
+        draws = self.draw_numbers(moving, situations)
         outcomes = np.zeros(self.num_envs, dtype=np.int64)
-        thresholds = self.tables.thresholds.take(pairs[moving], axis=1)
+        thresholds = self._thresholds.take(situations, axis=1)
         drawn = (draws >= thresholds[0]).astype(np.int64)
         for each in thresholds[1:]:
             drawn += draws >= each

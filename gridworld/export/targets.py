@@ -43,6 +43,7 @@ _WANDB: dict[str, Any] = {
     "host": "",
     "console": "off",
 }
+_MLFLOW_UI = "pip install mlflow && mlflow ui --backend-store-uri {place}"  # mlflow-skinny has no pages
 _MLFLOWS_MOST = {"metrics": 1000, "params": 100}  # at a time
 _LONGEST_PARAM = 6000  # characters
 _RESULTS = "results.json"
@@ -59,7 +60,7 @@ these scores are exact, of the greedy policy and of the one that it explores wit
 ## Use
 
 ```bash
-pip install gridworld-sb3 huggingface_hub
+pip install huggingface_hub  # and gridworld, from its repository
 ```
 
 ```python
@@ -260,7 +261,7 @@ class Target:
 
 TARGETS = {
     "wandb": Target(to_wandb, "wandb sync {out}/wandb/offline-run-*", ("wandb",)),
-    "mlflow": Target(to_mlflow, "mlflow ui --backend-store-uri {place}", ("mlflow", "sqlalchemy", "alembic")),
+    "mlflow": Target(to_mlflow, _MLFLOW_UI, ("mlflow", "sqlalchemy", "alembic")),
     "hub": Target(to_hub, "hf upload USER/MODEL {place}"),
 }
 

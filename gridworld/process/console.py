@@ -129,8 +129,8 @@ def printing() -> Iterator[None]:
         sys.stderr.flush()
         if _failures:
             raise InputError(
-                f"standard output: cannot be written ({_failures[0].strerror}), what was printed is not "
-                "complete; send it to where there is room"
+                f"standard output: cannot be written ({_failures[0].strerror}), so the output is "
+                "incomplete; write it to a disk with free space"
             )
 
 
@@ -168,12 +168,9 @@ def tell_error(text: str) -> None:
 
 
 def aligned(rows: Sequence[Sequence[str]], columns: Sequence[str]) -> list[str]:
-    """Align cells in columns that are at least a blank apart, a line for each row.
+    """Align cells in columns that are a blank apart, a line for each row.
 
-    Args:
-        rows: the cells, as many in every row as there are `columns`.
-        columns: for each, "<" to align left (words) or ">" to align right (numbers), and its least width,
-            e.g. ">9". A column is as wide as its widest cell.
+    `columns` says for each "<" to align left (words) or ">" right (numbers), and its least width, as ">9".
     """
     forms = [
         f"{column[0]}{max([int(column[1:]), *(len(row[index]) for row in rows)])}"
@@ -197,9 +194,10 @@ class ProgressLine:
         self._shown = ""
 
     def show(self, text: Callable[[], str]) -> None:
-        """Print the line that `text` returns; it is called only if a line is due."""
+        """Print the line that `text` returns, which is called if one is due; without its label if long."""
         if self._enabled and self._in_place:
-            line = text()[: shutil.get_terminal_size(_SIZE_OF_NOTEBOOK).columns - 1]
+            line, room = text(), shutil.get_terminal_size(_SIZE_OF_NOTEBOOK).columns - 1
+            line = line if len(line) <= room else line.split(": ", 1)[-1][:room]
             print(f"\r{line:<{len(self._shown)}}", end="", file=sys.stderr, flush=True)
             self._shown = line
         elif self._enabled and time.monotonic() - self._printed >= self._seconds_between_lines:
@@ -210,6 +208,7 @@ class ProgressLine:
         """Remove the line from a terminal."""
         if self._shown:
             print(f"\r{'':{len(self._shown)}}\r", end="", file=sys.stderr, flush=True)
+            self._shown = ""
 
     def close(self) -> None:
         """Leave the line on a terminal as it is, and begin another."""
@@ -232,7 +231,7 @@ class Progress(ProgressLine):
         first, begun = self._first
         left = time_left(step - first, total - step, now - begun) if step < total else ""
         share = min(step / total, 1.0)
-        self.show(lambda: f"{self._label}: step {step:,} of {total:,} ({share:.0%}){left}, {note}")
+        self.show(lambda: f"{self._label}: step {step:,} of {total:,} ({share:.0%}), {note}{left}")
 
 
 _is_telling: ContextVar[bool] = ContextVar("is_telling", default=False)
@@ -248,21 +247,35 @@ def telling_if_slow(what: str) -> Iterator[None]:
     if not is_limited() or _is_telling.get():
         yield
         return
-    token, over, began = _is_telling.set(True), threading.Event(), time.monotonic()
+    token, began = _is_telling.set(True), time.monotonic()
 
-    def tell_now_and_then() -> None:
-        while not over.wait(_SECONDS_BETWEEN_LINES):
-            seconds = time.monotonic() - began
-            print(f"{printable(what)}: {seconds:.0f} s so far; Ctrl-C ends it", file=sys.stderr, flush=True)
+    def tell_seconds() -> None:
+        seconds = time.monotonic() - began
+        print(f"{printable(what)}: {seconds:.0f} s so far; Ctrl-C ends it", file=sys.stderr, flush=True)
 
-    teller = threading.Thread(target=tell_now_and_then, daemon=True)
-    teller.start()
+    try:
+        with repeating(_SECONDS_BETWEEN_LINES, tell_seconds):
+            yield
+    finally:
+        _is_telling.reset(token)
+
+
+@contextmanager
+def repeating(seconds: float, call: Callable[[], None]) -> Iterator[None]:
+    """Call a function every so many seconds, in a thread, while the block runs."""
+    over = threading.Event()
+
+    def work() -> None:
+        while not over.wait(seconds):
+            call()
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
     try:
         yield
     finally:
         over.set()
-        teller.join()
-        _is_telling.reset(token)
+        thread.join()
 
 
 def time_left(done: int, to_do: int, seconds: float) -> str:

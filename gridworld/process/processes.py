@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import math
 import multiprocessing
 import os
 import re
@@ -12,16 +13,19 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
+from gridworld.process.console import tell
 from gridworld.process.signals import blocking, exiting, handling, send_sigterm
+from gridworld.process.together import LARGEST
 
 Task = Callable[..., Any]
+T = TypeVar("T")
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _SECONDS_BETWEEN_TICKS = 0.5
@@ -65,112 +69,103 @@ class LostError(Exception):
     """A task's process was lost."""
 
 
-def run_in_processes(
-    next_task: Callable[[], Task | None],
-    count: int,
-    forks: bool,
-    ended: Callable[[Any, Any], None],
-    tick: Callable[[], None] = lambda: None,
-    answer: Callable[[Any], Any] | None = None,
-) -> None:
-    """Run tasks until all have ended. A process takes the next task when it has ended one.
+class Processes:
+    """Processes on this machine, `count` at once, forks with what this process has imported or new ones.
 
-    The first signal to stop is passed on, so that tasks stop at a safe point; the second too, so that they
-    stop soon; at a third they are killed.
-
-    Args:
-        next_task: returns a task, or None if there is none; it is asked again whenever one has ended. Tasks
-            and what they return are pickled; they raise `SystemExit` only.
-        count: how many processes there are at once.
-        forks: whether these are forks, with what this process has imported.
-        ended: called with each task and what it returned, or a `LostError`.
-        tick: called every now and then.
-        answer: returns the answer to a message. Tasks are then called with a function that sends a message,
-            and returns the answer.
-
-    Raises:
-        SystemExit: this process was told to stop by SIGINT or SIGTERM, and so was each; all have ended.
+    They run tasks. These are pickled, as is what they return, and raise `SystemExit` only. A task whose
+    process is lost is run again, `attempts` times in all.
     """
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()  # or a fork would write it once more
-    if forks:
-        gc.freeze()  # so that they share what there is
-    else:
-        resource_tracker.ensure_running()  # which else would unblock signals while a process starts
-    workers = _Workers(next_task, count, forks, ended, answer)
-    with handling(dict.fromkeys(_SIGNALS, workers.stop)):
-        workers.run(tick)
-    if workers.received:
-        raise SystemExit(128 + workers.received[0])
 
-
-class _Workers:
-    """The processes at work, and who takes what they say; the arguments are those of `run_in_processes`."""
-
-    def __init__(
-        self,
-        next_task: Callable[[], Task | None],
-        count: int,
-        forks: bool,
-        ended: Callable[[Any, Any], None],
-        answer: Callable[[Any], Any] | None,
-    ) -> None:
-        self.received: list[int] = []  # signals
-        self._next_task, self._count, self._ended, self._answer = next_task, count, ended, answer
+    def __init__(self, count: int, forks: bool, attempts: int = 1) -> None:
+        self.count, self.forks, self.attempts = count, forks, attempts
+        self._received: list[int] = []
         self._context: Any = multiprocessing.get_context("fork" if forks else "spawn")
-        self._at_work: dict[Any, tuple[Any, Task | None]] = {}  # by connection: the process, its task
+        # By connection: the process, its task, and how many processes that has lost.
+        self._at_work: dict[Any, tuple[Any, Task | None, int]] = {}
+        self._again: list[tuple[Task, int]] = []  # tasks whose process was lost
 
-    def run(self, tick: Callable[[], None]) -> None:
-        """Run tasks until all have ended; whatever stops that, no process is left."""
-        try:
-            self._start_missing()
-            while self._at_work:
-                for connection in wait(list(self._at_work), _SECONDS_BETWEEN_TICKS):
-                    self._take(connection)
+    def shares(self, runs: Sequence[T], can_join: bool) -> Iterator[Sequence[T]]:
+        """Divide runs into tasks: of runs that train together as many to each process, of others one each."""
+        size = max(1, min(LARGEST, math.ceil(len(runs) / self.count))) if can_join else 1
+        return (runs[start : start + size] for start in range(0, len(runs), size))
+
+    def run(
+        self,
+        tasks: Iterable[Task],
+        ended: Callable[[Any, Any], None] = lambda task, result: None,
+        tick: Callable[[], None] = lambda: None,
+        answer: Callable[[Any], Any] | None = None,
+    ) -> None:
+        """Run tasks until all have ended; whatever stops that, no process is left.
+
+        The next task is taken when there is a process for it. `ended` gets each task and what it returned, or
+        a `LostError`; `tick` is called every now and then. With `answer`, tasks are called with a function
+        that sends a message and returns its answer.
+
+        The first SIGINT or SIGTERM is passed on, so that tasks stop at a safe point; the second too, so that
+        they stop soon; at a third they are killed. Then this raises `SystemExit`.
+        """
+        self._tasks, self._ended, self._answer = iter(tasks), ended, answer
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()  # or a fork would write it once more
+        if self.forks:
+            gc.freeze()  # so that they share what there is
+        else:
+            resource_tracker.ensure_running()  # which else would unblock signals while a process starts
+        with handling(dict.fromkeys(_SIGNALS, self._stop)):
+            try:
                 self._start_missing()
-                tick()
-        finally:
-            for process, _ in self._at_work.values():
-                process.kill()
-                process.join()
+                while self._at_work:
+                    for connection in wait(list(self._at_work), _SECONDS_BETWEEN_TICKS):
+                        self._take(connection)
+                    self._start_missing()
+                    tick()
+            finally:
+                for process, *_ in self._at_work.values():
+                    process.kill()
+                    process.join()
+        if self._received:
+            raise SystemExit(128 + self._received[0])
 
-    def stop(self, number: int, frame: FrameType | None) -> None:
+    def _stop(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal: pass it on."""
-        self.received.append(number)
-        for process, _ in self._at_work.values():
+        self._received.append(number)
+        for process, *_ in self._at_work.values():
             with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGKILL if len(self.received) > 2 else number)
+                os.kill(process.pid, signal.SIGKILL if len(self._received) > 2 else number)
 
-    def _next(self) -> Task | None:
-        return None if self.received else self._next_task()
+    def _next(self) -> tuple[Task | None, int]:
+        if self._received:
+            return None, 0
+        return self._again.pop() if self._again else (next(self._tasks, None), 0)
 
     def _start_missing(self) -> None:
-        while len(self._at_work) < self._count and (task := self._next()) is not None:
+        while len(self._at_work) < self.count and (following := self._next())[0] is not None:
             connection, theirs = self._context.Pipe()
             with blocking(*_SIGNALS):  # until the process has handlers of its own
                 may_ask = self._answer is not None
                 process = self._context.Process(target=_work, args=(theirs, os.getpid(), may_ask))
                 process.start()
-                self._give(connection, process, task)
+                self._give(connection, process, following)
             theirs.close()
 
-    def _give(self, connection: Any, process: Any, task: Task | None) -> None:
+    def _give(self, connection: Any, process: Any, following: tuple[Task | None, int]) -> None:
         """Let a process begin a task; None: let it end."""
-        self._at_work[connection] = process, task
+        self._at_work[connection] = (process, *following)
         with contextlib.suppress(OSError):  # it has ended
-            connection.send(task)
+            connection.send(following[0])
 
     def _take(self, connection: Any) -> None:
         """Take a result, answer a message, or note that the process has ended."""
-        process, task = self._at_work[connection]
+        process, task, lost = self._at_work[connection]
         try:
             is_result, content = connection.recv()
         except (EOFError, OSError):
             del self._at_work[connection]
             connection.close()
             process.join()
-            if task is not None and not self.received:
-                self._ended(task, LostError(f"exit code {process.exitcode}"))
+            if task is not None and not self._received:
+                self._lose(task, lost + 1, f"exit code {process.exitcode}")
             return
         if is_result:
             self._ended(task, content)
@@ -180,11 +175,19 @@ class _Workers:
             with contextlib.suppress(OSError):
                 connection.send(reply)
 
+    def _lose(self, task: Task, lost: int, why: str) -> None:
+        if self.attempts > 1:
+            tell(f"a worker died ({why}), attempt {lost} of {self.attempts} at its task")
+        if lost < self.attempts:
+            self._again.append((task, lost))
+        else:
+            self._ended(task, LostError(why))
+
 
 def _work(connection: Connection[Any, Any], parent: int, may_ask: bool) -> None:
     """What a process does."""
     os.setpgrp()  # a terminal's Ctrl-C reaches the parent, which passes it on once
-    threading.Thread(target=_end_with, args=(parent,), daemon=True, name="watch on the parent").start()
+    end_with(parent)
 
     def ask(message: Any) -> Any:
         connection.send((False, message))
@@ -196,10 +199,14 @@ def _work(connection: Connection[Any, Any], parent: int, may_ask: bool) -> None:
             connection.send((True, task(ask) if may_ask else task()))
 
 
-def _end_with(parent: int) -> None:
+def end_with(parent: int) -> None:
     """End this process soon after its parent, even if that is killed: first by SIGTERM, then in any case."""
-    while os.getppid() == parent:
-        time.sleep(_SECONDS_BETWEEN_CHECKS)
-    send_sigterm()
-    time.sleep(_GRACE_SECONDS)
-    os._exit(1)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_SECONDS_BETWEEN_CHECKS)
+        send_sigterm()
+        time.sleep(_GRACE_SECONDS)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True, name="watch on the parent").start()

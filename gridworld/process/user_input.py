@@ -77,8 +77,8 @@ def check_memory(what: object, size: float) -> None:
     if most is not None and size > most:
         enough = min(math.ceil(size / 1e9), 999_999)
         raise BudgetError(
-            f"{what}: would take about {_shown(size)} of memory, the budget is {_shown(most)}; if you trust "
-            f"it and have room for it, set {VARIABLE}={enough}GB"
+            f"{what}: would take about {_shown(size)} of memory, but the budget is {_shown(most)}; if you "
+            f"trust it and have the memory, set {VARIABLE}={enough}GB"
         )
 
 
@@ -129,10 +129,8 @@ def npz_arrays(
 ) -> dict[str, NDArray[Any]]:
     """Read all arrays of an .npz from its content, and nothing pickled; else an `InputError`.
 
-    Args:
-        where: the file, for messages; and `kind`, what it must be.
-        most: bytes that they may have in memory, for a file that may be compressed. None: as many as the
-            file has, which then must not be.
+    `where` is the file, and `kind` what it must be, for messages. They may have `most` bytes in memory; None:
+    as many as the file has, which then must not be compressed.
     """
     import numpy as np
 
@@ -142,7 +140,7 @@ def npz_arrays(
         size = sum(info.file_size for info in infos)
         # What is compressed, or there twice, could grow in reading.
         if most is None and (size > len(content) or any(info.compress_type for info in infos)):
-            raise ValueError("its members are larger than itself")
+            raise ValueError("its members are larger than the file")
         if most is not None and size > most:
             raise ValueError(f"its arrays have {size / 2**20:,.0f} MiB, more than {most / 2**20:,.0f}")
         check_memory(where, COPIES * size)
@@ -164,9 +162,7 @@ def imported(where: str, path: Any) -> Any:
         if error.name in _EXTRAS:
             package, extra = _EXTRAS[error.name]
             raise InputError(f"{where}={path}: needs {package}; {install_command(extra)}") from None
-        raise InputError(
-            f"{where}={path}: there is no module {error.name}; is the folder that it is in on PYTHONPATH?"
-        ) from None
+        raise InputError(f"{where}={path}: no module {error.name}; is its folder on PYTHONPATH?") from None
     except (ValueError, TypeError):  # no path at all
         return None
     except Exception as error:  # a module of the user's own may raise anything

@@ -14,11 +14,14 @@ from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from gridworld.errors import InputError
 from gridworld.report import chart
 from gridworld.report.analysis import METRICS, Band, Overall, Result, TaskAnalysis
 from gridworld.report.chart import INK, MUTED, PAPER, Chart, Styles, house_style
 from gridworld.report.setting_charts import sweep_charts, sweeps
 from gridworld.report.statistics import INFINITE, Interval
+from gridworld.world import metrics
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
 
 _HEIGHT = 190.0  # points, of curves
@@ -37,7 +40,7 @@ def task_charts(analysis: TaskAnalysis, styles: Styles) -> Iterator[Chart]:
         yield from sweep_charts(sweep, analysis.task)
     shown = [result for result in analysis.results if result in analysis.ranked[:_MOST_DRAWN]]
     drawn, count = replace(analysis, results=tuple(shown)), len(analysis.results)
-    more = f"; the {_MOST_DRAWN} best of {count}" if count > len(shown) else ""
+    more = f"; the best {_MOST_DRAWN} of {count}" if count > len(shown) else ""
     yield from _curves(drawn, styles, more)
     if count == 1 and len(shown[0].group.runs) == 1:
         return  # a strip would have one dot
@@ -72,7 +75,7 @@ def _curves(analysis: TaskAnalysis, styles: Styles, more: str) -> Iterator[Chart
             f"{task} certified",
             f"Seeds certified optimal on {task}",
             describe(
-                "share of seeds whose greedy policy is optimal from the start",
+                "share of seeds whose greedy policy is optimal from the start state",
                 "bands are Wilson's 95 % intervals",
             ),
             bands,
@@ -85,14 +88,42 @@ def _curves(analysis: TaskAnalysis, styles: Styles, more: str) -> Iterator[Chart
         # The first tenth, where most is learnt, would flatten all the rest.
         late = np.concatenate([band.point[len(band.point) // 10 :] for band in bands.values()])
         yield draw(
-            f"{task} on-line return",
-            f"On-line return on {task}",
+            f"{task} online_return",
+            f"Online return on {task}",
             describe("mean return of the training episodes, exploration included", _BOOTSTRAP),
             bands,
             label="return",
             bounds=_bounds(late),
             references={"optimum": world.optimal_return},
         )
+
+
+def run_chart(
+    key: str, curve: Mapping[str, FloatArray], evaluator: Evaluator, summary: Mapping[str, Any]
+) -> Chart:
+    """The exact curves of one run's two policies in a metric. Raises `InputError` where there is none."""
+    metric = next((each for each in metrics.METRICS if each.name == key), None)
+    if metric is None:
+        known = ", ".join(each.name for each in metrics.METRICS)
+        raise InputError(f"metric={key!r:.80}: no such curve; choose from {known}")
+    steps, bands = curve["step"], dict[str, Band]()
+    for name, column in (("greedy", key), ("with exploration", f"sampled_{key}")):
+        unknown = np.full(len(steps), math.nan)
+        bands[name] = Band(steps, curve[column], unknown, unknown, int(steps[-1]))
+    mdp = evaluator.mdp
+    random = evaluator.score(np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions))
+    optimum = metric.of(metrics.optimal_score(evaluator))
+    title = f"{metric.label[0].upper()}{metric.label[1:]} of {summary['agent']} on {summary['env']}"
+    return _draw_curves(
+        title,
+        title,
+        f"{metric.label}, exact, of the greedy policy and of the one that it explores with",
+        bands,
+        chart.styles(list(bands)),
+        metric.label,
+        _bounds(np.concatenate([*(band.point for band in bands.values()), [optimum]])),
+        references={"optimum": optimum, "uniformly random": metric.of(random)},
+    )
 
 
 def _description(what: str, statistic: str, results: Sequence[Result], more: str) -> str:
@@ -225,15 +256,15 @@ def overall_charts(overall: Overall, styles: Styles) -> Iterator[Chart]:
     """As rliable has them: a profile for each agent, and for each metric the pairs, unless all are even."""
     ranked = sorted(overall.profiles, key=lambda agent: -overall.optimality[agent][1].point)
     shown = ranked[:_MOST_DRAWN]
-    most = f"; the {len(shown)} best of {len(ranked)}" if len(ranked) > len(shown) else ""
+    most = f"; the best {len(shown)} of {len(ranked)}" if len(ranked) > len(shown) else ""
     levels, end = overall.levels, math.ceil(overall.levels[-1])
     profiles = {agent: overall.profiles[agent] for agent in shown}
     yield _draw_curves(
         "all tasks profiles",
         "Performance profiles over all tasks",
-        f"share of runs whose optimality is above each level, as the mean over tasks{most}; 95 % pointwise "
-        "intervals from the stratified bootstrap",
-        {agent: Band(levels, point, point, low, high, end) for agent, (point, low, high) in profiles.items()},
+        f"share of runs whose optimality is above each level, averaged over tasks{most}; pointwise 95 % "
+        "stratified bootstrap intervals",
+        {agent: Band(levels, point, low, high, end) for agent, (point, low, high) in profiles.items()},
         styles,
         "runs above it",
         (0.0, 1.0),
@@ -264,7 +295,7 @@ def _improvements(metric: str, pairs: Mapping[tuple[str, str], Interval], styles
         _draw_interval(axes, row, found, styles[one]["color"])
     description = (
         "probability that a run of the first agent is better than one of the second, ties half: the mean "
-        "over the tasks that both were run on, with 95 % intervals from the stratified bootstrap; at the "
-        "dashed line neither is better"
+        "over the tasks that both ran on, with 95 % stratified bootstrap intervals; at the dashed line "
+        "neither is better"
     )
     return Chart(f"all tasks improvement in {metric}", title, description, figure)

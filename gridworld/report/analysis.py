@@ -6,13 +6,12 @@ import dataclasses
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-import gridworld
 from gridworld.config.train import check_bounds
 from gridworld.config.worlds import schema_of
 from gridworld.errors import InputError
@@ -30,6 +29,7 @@ from gridworld.report.evidence import (
 from gridworld.report.grouping import Group, Study, arrange
 from gridworld.report.statistics import Interval, Share
 from gridworld.report.tuning_study import TuningStudy, find_tunings
+from gridworld.run.provenance import versions
 from gridworld.run.reader import read_run, stored_world
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
@@ -59,7 +59,7 @@ def _reference(run: Evidence) -> Reference:
     try:
         schema = schema_of(run.world)
         if unknown := sorted(run.world.keys() - {each.name for each in dataclasses.fields(schema)}):
-            raise ValueError(f"env.{unknown[0]} is not known to this version")
+            raise ValueError(f"env.{unknown[0]} is unknown to this version")
         lines = run.layout.split("\n")
         if len(lines) * max(map(len, lines)) > _MOST_CELLS:
             raise ValueError(f"it has more than {_MOST_CELLS:,} cells")
@@ -70,12 +70,12 @@ def _reference(run: Evidence) -> Reference:
         random = evaluator.score(np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions))
     except (ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError) as error:
         # Whatever is wrong with another version's world, the runs' own scores are as good as before.
-        return Reference(run.optimal_value, problem=f"its world cannot be built again here ({error})")
+        return Reference(run.optimal_value, problem=f"its world cannot be rebuilt here ({error})")
     optimum, problem = evaluator.optimal_value, None
     if not math.isclose(optimum, run.optimal_value, rel_tol=_TOLERANCE, abs_tol=_TOLERANCE):
         problem = (
-            f"its optimal value is {optimum:.6g} here, and {run.optimal_value:.6g} according "
-            f"to {run.folder}; was it written by another version?"
+            f"its optimal value is {optimum:.6g} here, but {run.optimal_value:.6g} according to "
+            f"{run.folder}; was it written by another version?"
         )
     returns = evaluator.optimum.expected_return, random.outcome.expected_return
     return Reference(run.optimal_value, returns[0], random.value, returns[1], problem)
@@ -123,8 +123,8 @@ _METRICS = (
     RunMetric("optimality", "optimality", _optimality, ("iqm", "mean")),
     *(RunMetric(metric.name, metric.label, _last(metric.name)) for metric in REPORTED),
     RunMetric("sampled_return", "sampled policy's return", _last(SAMPLED_RETURN)),
-    RunMetric("online_return", "on-line return, all of training", lambda run, _: online_return(run)),
-    RunMetric("online_return_end", "on-line return, last tenth", lambda run, _: online_return(run, 0.1),
+    RunMetric("online_return", "online return, all of training", lambda run, _: online_return(run)),
+    RunMetric("online_return_end", "online return, last tenth", lambda run, _: online_return(run, 0.1),
               is_compared=True),
 )
 # fmt: on
@@ -137,7 +137,6 @@ class Band:
 
     steps: FloatArray
     point: FloatArray
-    mean: FloatArray
     low: FloatArray
     high: FloatArray
     whole_until: int  # environment steps that all runs reach; later, ended runs keep their last value
@@ -162,12 +161,12 @@ def on_grid(run: Evidence, column: str, grid: FloatArray) -> FloatArray:
 
 
 def _band(runs: Sequence[Evidence], column: str, grid: FloatArray, seed: int) -> Band:
-    """IQM and mean of a column over runs, from the first step at which all have a value."""
+    """The IQM of a column over runs, from the first step at which all have a value."""
     values = np.stack([on_grid(run, column, grid) for run in runs], axis=-1)
     is_whole = ~np.isnan(values).any(axis=-1)
     grid, values = grid[is_whole], values[is_whole]
     point, low, high = statistics.bands(statistics.iqm, [values], seed)
-    return Band(grid, point, values.mean(axis=-1), low, high, min(run.steps for run in runs))
+    return Band(grid, point, low, high, min(run.steps for run in runs))
 
 
 def _certificates(runs: Sequence[Evidence], grid: FloatArray) -> Band:
@@ -175,7 +174,7 @@ def _certificates(runs: Sequence[Evidence], grid: FloatArray) -> Band:
     counts = np.sum([on_grid(run, "certified", grid) for run in runs], axis=0)
     shares = [statistics.share(int(count), len(runs)) for count in counts]
     low, high = np.array([(share.low, share.high) for share in shares]).T
-    return Band(grid, counts / len(runs), counts / len(runs), low, high, min(run.steps for run in runs))
+    return Band(grid, counts / len(runs), low, high, min(run.steps for run in runs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,6 +221,19 @@ class TaskAnalysis:
 
         return sorted(self.results, key=rank)
 
+    @property
+    def best(self) -> list[Result]:
+        """The first of the ranked, and those of which no interval says that they are worse."""
+        first, *others = self.ranked
+
+        def is_worse(other: Result) -> bool:
+            agents = first.group.agent, other.group.agent
+            sooner, less = (self.comparisons[key, *agents] for key in ("steps", "regret"))
+            more = statistics.difference(first.certified, other.certified)
+            return more.low > 0 or sooner.low > 0.5 or less.low > 0.5
+
+        return [first, *(each for each in others if not is_worse(each))]
+
 
 @dataclass(frozen=True, eq=False)
 class Overall:
@@ -232,10 +244,6 @@ class Overall:
     comparisons: Comparisons  # the mean over the tasks of both
     levels: FloatArray  # of optimality, (points,)
     profiles: Mapping[str, tuple[FloatArray, ...]]  # by agent: share of runs above each level, low and high
-
-
-class NothingFinishedError(InputError):
-    """No run can be used, and none is damaged: they are not finished."""
 
 
 @dataclass(frozen=True)
@@ -294,22 +302,21 @@ def gather(paths: Sequence[Path], seed: int = 0, log_steps: bool = False) -> Rep
     if not runs:
         sentences = [*problems, *(reason for run in unusable for reason in run.reasons)]
         more = f"; and {len(sentences) - MOST_SHOWN} more" if len(sentences) > MOST_SHOWN else ""
-        is_damage = any(run.state == DAMAGED for run in unusable)
-        kind = NothingFinishedError if unusable and not is_damage else InputError
-        raise kind(f"nothing to report: {'; '.join(sentences[:MOST_SHOWN])}{more}")
+        raise InputError(f"nothing to report: {'; '.join(sentences[:MOST_SHOWN])}{more}")
     study = arrange(runs)
     tasks = tuple(_task(task, study.on(task), seed, log_steps) for task in study.tasks)
     tunings, unread = find_tunings(paths)
     problems += [f"{task.task}: {task.world.problem}" for task in tasks if task.world.problem]
     problems += unread
-    versions: dict[str, list[Path]] = defaultdict(list)
+    by_version: dict[str, list[Path]] = defaultdict(list)
     for run in runs:
-        versions[run.version].append(run.folder)
+        by_version[run.version].append(run.folder)
+    own = str(versions()["gridworld"])
     notes = [
         f"{len(found)} {'runs were' if len(found) > 1 else 'run was'} written by gridworld {version}, "
-        f"this is {gridworld.__version__}: {found[0]}{' and others' if len(found) > 1 else ''}."
-        for version, found in sorted(versions.items())
-        if version != gridworld.__version__
+        f"this is {own}: {found[0]}{' and others' if len(found) > 1 else ''}."
+        for version, found in sorted(by_version.items())
+        if version != own
     ]
     overall = _overall(tasks, seed)
     return Report(study, tasks, overall, unusable, tuple(problems), tuple(notes), seed, tuple(tunings))
@@ -386,23 +393,3 @@ def _overall(tasks: Sequence[TaskAnalysis], seed: int) -> Overall | None:
     levels = np.linspace(min(0.0, max(-1.0, lowest)), 1.0, _LEVELS)
     profiles = {agent: statistics.profile(each, levels, seed) for agent, each in strata.items()}
     return Overall(len(tasks), optimality, _compare(samples, seed), levels, profiles)
-
-
-def reasons(
-    groups: Iterable[Group], ask: Callable[[Path], Reason | None], most: int
-) -> tuple[Reasons, list[str]]:
-    """Ask why runs are not certified, the first seed of each group before the second of any.
-
-    `ask` gives the reason of the run in a folder, None where it does not know; `most` is how many runs to ask
-    about. Returns the reasons, and a sentence for each run of which a file is damaged.
-    """
-    found, problems = {}, []
-    columns = ([run for run in group.runs if not run.certified] for group in groups)
-    in_turn = (run for row in itertools.zip_longest(*columns) for run in row if run is not None)
-    for run in itertools.islice(in_turn, most):
-        try:
-            if (reason := ask(run.folder)) is not None:
-                found[run.folder] = reason
-        except InputError as error:
-            problems.append(f"{run.folder}: is not diagnosed; {error}")
-    return found, problems

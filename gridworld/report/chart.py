@@ -102,6 +102,15 @@ class Chart:
         return buffer.getvalue()
 
 
+class NotebookFigure(Figure):
+    """Is shown in a notebook, whether pyplot was imported there or not."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", dpi=1.5 * _POINTS)
+        return buffer.getvalue()
+
+
 def new_figure(
     heading: str,
     height: float,
@@ -118,7 +127,7 @@ def new_figure(
         lines = -(-len(names) // columns)
     size = width / _POINTS, (height + 64 + LINE * lines) / _POINTS
     layout = ConstrainedLayoutEngine(w_pad=8 / _POINTS, h_pad=4 / _POINTS)
-    figure = Figure(figsize=size, dpi=_POINTS, layout=layout)
+    figure = NotebookFigure(figsize=size, dpi=_POINTS, layout=layout)
     axes = figure.add_subplot(facecolor="none")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))

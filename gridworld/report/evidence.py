@@ -113,8 +113,8 @@ def find_runs(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
         for folder in found:
             folders.setdefault(folder.resolve(), folder)
         if not found:
-            where = f"there is no {MANIFEST} in it or below it (links to folders are not followed)"
-            problems.append(f"{path}: holds no run, {where}")
+            where = f"no {MANIFEST} in it or below it (links to folders are not followed)"
+            problems.append(f"{path}: contains no run: {where}")
     return list(folders.values()), problems
 
 
@@ -130,7 +130,7 @@ def _search(top: Path, problems: list[str]) -> Iterator[Path]:
             yield Path(name)
         entries += len(inner) + len(files)
         if entries > MOST_ENTRIES:
-            most = f"holds more than {MOST_ENTRIES:,} files and folders, the rest was not searched"
+            most = f"contains more than {MOST_ENTRIES:,} files and folders; the rest was not searched"
             problems.append(f"{top}: {most}; name the folders of the runs")
             return
         inner.sort()
@@ -161,10 +161,10 @@ def _unfinished(run: RunReader) -> str:
     """How far a run came, and why it ended."""
     status, cause = run.manifest["status"][:_LONGEST_NAME], run.manifest.get("error")
     why = f": {' '.join(cause.split())[:300]}" if cause else ""
-    why = ": it is still running, or was killed" if status == "running" else why
+    why = ": it is still running or was killed" if status == "running" else why
     try:
         steps = f"{_read_curve(run)['step'][-1]:,.0f} steps"
-        why += f" (last evaluated after {steps}, says {CURVE}, which is not verified before the end)"
+        why += f" (last evaluated after {steps}, according to the unverified {CURVE})"
     except InputError:
         pass  # it has not been evaluated
     return f"{run.folder}: this run is {status!r}, not finished{why}"
@@ -173,7 +173,7 @@ def _unfinished(run: RunReader) -> str:
 def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
     manifest, config, where = run.manifest, run.manifest["config"], f"{run.manifest_file}: config"
     if not isinstance(config.get("env"), dict):
-        raise InputError(f"{where}.env must be the settings of the world; is it of another version?")
+        raise InputError(f"{where}.env must be the settings of the world; was it written by another version?")
     summary, versions = run.read_summary(), manifest.get("versions")
     of_summary = str(run.summary_file)
     return Evidence(
@@ -207,7 +207,9 @@ def _entry(content: Any, key: str, kind: type, where: str) -> Any:
     value: Any = content.get(key) if isinstance(content, dict) else None
     fits = isinstance(value, int | float if kind is float else kind) and not isinstance(value, bool)
     if not fits or (kind is str and not value.strip()):
-        raise InputError(f"{where}: {key}={value!r} must be {_KINDS[kind]}; is it of another version?")
+        raise InputError(
+            f"{where}: {key}={value!r} must be {_KINDS[kind]}; was it written by another version?"
+        )
     return _printable(value) if kind is str else kind(value)
 
 
@@ -231,18 +233,18 @@ def read_columns(run: RunReader, wanted: Sequence[str] | None = None) -> dict[st
     path = run.curve_file
     lines = as_table(run.read(path, LARGEST_CSV), path).splitlines()
     if lines and lines[0].count(",") >= _MOST_COLUMNS:
-        raise InputError(f"{path}: has more than {_MOST_COLUMNS} columns; is it of another version?")
+        raise InputError(f"{path}: has more than {_MOST_COLUMNS} columns; was it written by another version?")
     try:
         header, *rows = list(csv.reader(lines)) or [[]]
     except csv.Error as error:
         raise InputError(f"{path}: is not valid CSV ({error})") from None
     if not rows:
-        raise InputError(f"{path}: has no row")
+        raise InputError(f"{path}: has no rows")
     if missing := [name for name in REQUIRED if name not in header]:
-        raise InputError(f"{path}: has no column {', '.join(missing)}; is it of another version?")
+        raise InputError(f"{path}: has no column {', '.join(missing)}; was it written by another version?")
     for line, row in enumerate(rows, 2):
         if len(row) != len(header):
-            raise InputError(f"{path}: line {line} has {len(row)} of {len(header)} columns, it was cut off")
+            raise InputError(f"{path}: line {line} has {len(row)} of {len(header)} columns; it was cut off")
     curve: dict[str, FloatArray] = {}
     for name in header if wanted is None else wanted:
         if name not in header:
@@ -256,7 +258,7 @@ def read_columns(run: RunReader, wanted: Sequence[str] | None = None) -> dict[st
             raise InputError(f"{path}: {name} is NaN or empty; the run diverged or the file was changed")
     steps = curve["step"]
     if steps[0] != 0 or not np.isfinite(steps).all() or (np.diff(steps) <= 0).any():
-        raise InputError(f"{path}: the steps do not rise from 0 on, from row to row")
+        raise InputError(f"{path}: the steps do not increase from 0, row by row")
     if not np.isin(curve["certified"], (0, 1)).all():
         raise InputError(f"{path}: certified must be 0 or 1 in every row")
     return curve

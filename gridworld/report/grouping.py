@@ -80,8 +80,8 @@ def arrange(runs: Iterable[Evidence]) -> Study:
             found = [settings for name, settings in named if name == agent]
             if len(found) > 1:
                 notes.append(
-                    f"{agent} on {task} was run with {len(found)} different configurations, which are "
-                    f"reported apart; they differ in {', '.join(differing(found))}."
+                    f"{agent} on {task} was run with {len(found)} different configurations, reported "
+                    f"separately; they differ in {', '.join(differing(found))}."
                 )
         for label, group in zip(labels(named), configurations.values(), strict=True):
             groups.append(Group(label, task, _one_per_seed(group, notes, warnings)))
@@ -175,13 +175,13 @@ def _one_per_seed(runs: list[Evidence], notes: list[str], warnings: list[str]) -
         if first is run:
             continue
         warnings += run.damage
-        text = f"{run.folder} has the settings and the seed of {first.folder}"
+        text = f"{run.folder} has the same settings and seed as {first.folder}"
         curves = [{name: column.tobytes() for name, column in each.curve.items()} for each in (first, run)]
         if curves[0] == curves[1]:
             notes.append(f"{text}, and the same curve; it is counted once.")
         else:
             warnings.append(
-                f"{text}, but ANOTHER curve (final regret {run.curve['regret'][-1]:.6g} against "
+                f"{text}, but a DIFFERENT curve (final regret {run.curve['regret'][-1]:.6g}, not "
                 f"{first.curve['regret'][-1]:.6g}): one command, two results. Only the latter is counted."
             )
     return tuple(kept[seed] for seed in sorted(kept))

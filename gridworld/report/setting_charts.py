@@ -5,9 +5,10 @@ Of a tuning study there are the three figures that Optuna draws: history, import
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,10 +18,10 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.lines import Line2D
 
 from gridworld.report import chart
-from gridworld.report.analysis import Result
+from gridworld.report.analysis import Result, TaskAnalysis
 from gridworld.report.chart import COLOURS, INK, MUTED, PAPER, SMALL, WIDE, Chart, clipped, house_style
 from gridworld.report.grouping import differing, learning_key
-from gridworld.report.statistics import Interval
+from gridworld.report.statistics import Interval, Share
 from gridworld.report.tables import estimate
 from gridworld.report.tuning_study import TrialRow, TuningStudy
 from gridworld.world.mdp import FloatArray
@@ -30,6 +31,7 @@ _LEAST = 3  # configurations that make a sweep, and more of them than settings t
 _LINE = 64  # characters of tick labels next to each other
 _NEVER = "#c6c6c6"  # of cells without a finite value: no colour of the ramp
 _RAMP = LinearSegmentedColormap.from_list("share", ["#eaf2f8", "#7fb8dc", "#0a5a8c"])
+_MOST_NAMED = 6  # settings in a sentence
 _HIGHEST = 1e200  # score that is drawn as it is; its inverse is the lowest
 _DONE, _WINNER = COLOURS[0], COLOURS[1]
 
@@ -74,7 +76,7 @@ _SHOWN = {  # title of a metric, and the statistic that the figures of a sweep s
     "certified": ("seeds certified", "share of seeds certified at the end"),
     "steps": (
         "steps to certificate",
-        "steps to the first certificate, median over seeds; none where half of them have no certificate",
+        "steps to the first certificate, median over seeds; none where fewer than half have one",
     ),
     "regret": ("final regret", "interquartile mean (IQM) over seeds"),
 }
@@ -88,6 +90,27 @@ def _of(result: Result, metric: str) -> tuple[Interval, str]:
     found = estimate(result, metric, "median" if metric == "steps" else "iqm")
     assert found is not None  # every run has them
     return found.interval, found.form(found.interval.point)
+
+
+def sweep_answer(task: TaskAnalysis) -> str:
+    """Where all seeds are certified and where none, if the task's results are one sweep; else ""."""
+    found = sweeps(task.results)
+    if len(found) != 1 or len(found[0].results) < len(task.results):
+        return ""
+    (sweep,) = found
+    keys = [_short(key) for key in sweep.keys]
+
+    def settings(certified: Callable[[Share], bool]) -> str:
+        places = [place for place in itertools.product(*sweep.values) if place in sweep.results]
+        chosen = [place for place in places if certified(sweep.results[place].certified)]
+        names = [" ".join(map("=".join, zip(keys, place, strict=True))) for place in chosen]
+        names = [name.removeprefix(f"{keys[0]}=") for name in names] if len(keys) == 1 else names
+        more = [f"{len(names) - _MOST_NAMED} more"] if len(names) > _MOST_NAMED else []
+        return ", ".join(names[:_MOST_NAMED] + more) or "no setting"
+
+    every, none = settings(lambda share: share.is_whole), settings(lambda share: share.count == 0)
+    by = f"{sweep.agent} by {' and '.join(keys)}: all seeds are certified with {every}"
+    return by if none == "no setting" else f"{by}; none with {none}"
 
 
 def sweep_charts(sweep: Sweep, task: str) -> Iterator[Chart]:
@@ -151,7 +174,7 @@ def _heatmap(sweep: Sweep, metric: str, name: str, title: str, description: str)
     shown_columns = [clipped(value, max(4, _LINE // len(columns))) for value in columns]
     axes.set_xticks(np.arange(len(columns)) + 0.5, shown_columns, color=INK, size=SMALL)
     axes.set_yticks(np.arange(len(rows)) + 0.5, [clipped(value, 14) for value in rows], color=INK, size=SMALL)
-    grey = "; grey cells have no finite value" if (levels < low).any() else ""
+    grey = "; grey: no finite value" if (levels < low).any() else ""
     return Chart(name, title, f"{description}; darker is better{grey}", figure)
 
 
@@ -197,7 +220,7 @@ def _history(tuning: TuningStudy) -> Chart:
     return Chart(
         f"{tuning.name} history",
         f"Score by trial, {tuning.title.lower()}",
-        "a dot for each trial, on a logarithmic scale, lower is better, and a line for the best so far",
+        "one dot per trial, and a line for the best so far; logarithmic scale, lower is better",
         figure,
     )
 
@@ -226,7 +249,7 @@ def _parallel(tuning: TuningStudy, done: Sequence[TrialRow]) -> Chart:
     scores, low, high = _scores(ranked)
     columns = [_axis({"type": "float", "low": low, "high": high, "log": True}, scores.tolist())]
     columns += [_axis(tuning.space[key], [trial.row[key] for trial in ranked]) for key in keys]
-    title = "What the best tenth of the finished trials chose, and the winner"
+    title = "Settings of the best tenth of the finished trials, and of the winner"
     figure, axes = chart.new_figure(title, 250, width=WIDE)
     axes.set(xlim=(0, max(1, len(keys))), ylim=(0, 1), xticks=[], yticks=[])
     lines = [list(enumerate(heights)) for heights in zip(*(each for each, _ in columns), strict=True)]
@@ -245,8 +268,8 @@ def _parallel(tuning: TuningStudy, done: Sequence[TrialRow]) -> Chart:
     return Chart(
         f"{tuning.name} parallel coordinates",
         f"Parallel coordinates, {tuning.title.lower()}",
-        f"a line for each finished trial through its score and values; the best {bold} stand out, "
-        "the winner most",
+        f"one line per finished trial through its score and settings; the best {bold} are highlighted, the "
+        "winner most",
         figure,
     )
 

@@ -34,14 +34,14 @@ _HEADINGS = {
 
 
 @dataclass(frozen=True)
-class Estimate:
+class IntervalCell:
     """An interval with the way its numbers are written."""
 
     interval: Interval
     form: Callable[[float], str]
 
 
-Cell = str | float | int | None | Share | Estimate
+Cell = str | float | int | None | Share | IntervalCell
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def texts(cell: Cell) -> tuple[str, str]:
             return cell, ""
         case Share(count, total, low, high):
             return f"{count} / {total}", f"[{100 * low:.0f} %, {100 * high:.0f} %]"
-        case Estimate(Interval(point, low, high), form):
+        case IntervalCell(Interval(point, low, high), form):
             return form(point), "" if math.isnan(low) else f"[{form(low)}, {form(high)}]"
         case int():
             return f"{cell:,}", ""
@@ -132,7 +132,7 @@ def to_csv(table: Table) -> str:
 def _csv_parts(cell: Cell) -> dict[str, object]:
     """What a cell comes to, by the ends of its columns' headings."""
     match cell:
-        case Estimate(Interval(point, low, high), _):
+        case IntervalCell(Interval(point, low, high), _):
             return {"": _digits(point), " low": _digits(low), " high": _digits(high)}
         case Share(count, total, low, high):
             return {"": count, " of": total, " low": _digits(low), " high": _digits(high)}
@@ -209,16 +209,16 @@ def scores_table(task: TaskAnalysis) -> Table:
     rows: list[list[Cell]] = [
         [result.group.agent, *(estimate(result, key, "mean") for key in keys)] for result in task.results
     ]
-    caption = f"Means over seeds on {task.task}, of the greedy policy where nothing else is said"
+    caption = f"Means over seeds on {task.task}, of the greedy policy unless stated otherwise"
     columns = ["agent", *(METRICS[key].title for key in keys)]
     return _table_of(task.results, f"{task.task} scores", caption, columns, rows)
 
 
-def estimate(result: Result, key: str, statistic: str) -> Estimate | None:
+def estimate(result: Result, key: str, statistic: str) -> IntervalCell | None:
     """A statistic of a metric as a cell; None where no run has the metric."""
     found = result.estimates.get((key, statistic))
     form = steps_up_to(result.shortest_uncertified) if key == "steps" else number
-    return None if found is None else Estimate(found, form)
+    return None if found is None else IntervalCell(found, form)
 
 
 def improvement_tables(comparisons: Comparisons, name: str) -> Iterator[Table]:
@@ -228,7 +228,9 @@ def improvement_tables(comparisons: Comparisons, name: str) -> Iterator[Table]:
         rows: list[list[Cell]] = []
         for one in agents:
             found = (comparisons.get((key, one, other)) for other in agents)
-            rows.append([one, *(None if each is None else Estimate(each, "{:.2f}".format) for each in found)])
+            rows.append(
+                [one, *(None if each is None else IntervalCell(each, "{:.2f}".format) for each in found)]
+            )
         caption = f"Probability that a run of the row's agent beats one of the column's in {title}"
         yield Table(f"{name} improvement in {title}", caption, ["agent", *agents], rows)
 
@@ -236,7 +238,7 @@ def improvement_tables(comparisons: Comparisons, name: str) -> Iterator[Table]:
 def overall_table(overall: Overall) -> Table:
     """One number an agent, over all its tasks."""
     rows: list[list[Cell]] = [
-        [agent, f"{count} of {overall.tasks}", Estimate(interval, number)]
+        [agent, f"{count} of {overall.tasks}", IntervalCell(interval, number)]
         for agent, (count, interval) in overall.optimality.items()
     ]
     return Table("all tasks", "Optimality over tasks", ["agent", "tasks", "optimality, IQM"], rows)
@@ -258,7 +260,7 @@ def runs_table(study: Study) -> Table:
         rows.append([group.task, group.agent, run.seed, certified, run.regret, first])
         rows[-1] += [run.steps, run.seconds, str(run.folder)]
     columns = ["task", "agent", "seed", "certified", "regret", "first certificate", "steps", "seconds"]
-    return Table("runs", "Every run that is counted", [*columns, "folder"], rows)
+    return Table("runs", "All runs that are counted", [*columns, "folder"], rows)
 
 
 def reasons_table(study: Study, reasons: Reasons) -> Table:
@@ -269,7 +271,7 @@ def reasons_table(study: Study, reasons: Reasons) -> Table:
         if (reason := reasons.get(run.folder)) is not None
     ]
     missing = sum(not run.certified for _, run in study.runs) - len(rows)
-    rest = f"; {missing} more were not looked into, see --diagnose" if missing else ""
+    rest = f"; {missing} more were not diagnosed, see --diagnose" if missing else ""
     columns = ["agent", "task", "seed", "regret", "largest cause", "to try"]
     return Table("not certified", f"Why runs are not certified{rest}", columns, rows)
 
@@ -304,10 +306,10 @@ def tuning_tables(tuning: TuningStudy) -> tuple[Table, Table, Table]:
         ]
         for trial in tuning.trials
     ]
-    caption = f"The winner, trial {tuning.winner}, beside what the search began from"
-    finalists = "The finalists, by all of their seeds"
+    caption = f"The winner, trial {tuning.winner}, and the baseline"
+    finalists = "The finalists, over all of their seeds"
     return (
-        Table(f"{tuning.name} winner", caption, ["key", "winner", "began from", "importance"], changed),
+        Table(f"{tuning.name} winner", caption, ["key", "winner", "baseline", "importance"], changed),
         Table(f"{tuning.name} finalists", finalists, ["trial", "score", "certified"], tuning.finalists),
         Table(
             f"{tuning.name} trials", "All trials", ["trial", "status", "score", *others, *tuning.space], rows

@@ -30,7 +30,7 @@ class TrialRow:
     row: Mapping[str, str]  # all columns, what was chosen by its key
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TuningStudy:
     """A finished study."""
 
@@ -46,6 +46,9 @@ class TuningStudy:
     importances: Mapping[str, float]
     finalists: Sequence[Sequence[str | float]]  # trial, score, certified; the winner first
     trials: Sequence[TrialRow]
+
+    def __repr__(self) -> str:
+        return f"TuningStudy({str(self.folder)!r}, {dict(self.values)}: {self.sentence})"
 
     @property
     def title(self) -> str:
@@ -81,8 +84,8 @@ def _read(folder: Path) -> TuningStudy:
     content, of_trials = read_sealed(file), read_bytes(trials, LARGEST_CSV)
     if content.get(TRIALS_SUM, digest := sha256(of_trials)) != digest:  # the first format has none
         raise InputError(
-            f"{trials}: is not the table that {STUDY_JSON} was written with; it was changed or damaged, or "
-            "the search was continued and has not finished"
+            f"{trials}: does not match {STUDY_JSON}; it was changed or damaged, or a continued search has "
+            "not finished"
         )
     table = as_table(of_trials, trials)
     check_memory(trials, _OF_A_TRIAL * table.count("\n"))

@@ -19,27 +19,19 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from PIL import Image
 
 from gridworld.config.train import PICTURES
 from gridworld.errors import InputError, reason
 from gridworld.process.console import plain, tell
 from gridworld.report import statistics, tables
-from gridworld.report.analysis import (
-    MOST_SHOWN,
-    Band,
-    NothingFinishedError,
-    Report,
-    Result,
-    TaskAnalysis,
-    gather,
-)
+from gridworld.report.analysis import MOST_SHOWN, Band, Report, Result, TaskAnalysis, gather
 from gridworld.report.tables import to_captioned_markdown, to_csv, to_markdown
 from gridworld.run.folder import EVENTS as EVENT_FILE
-from gridworld.run.folder import MANIFEST, check_writable
+from gridworld.run.folder import SUMMARY, check_writable
 from gridworld.storage.atomic_write import replacing_folder, write_text
 from gridworld.storage.safe_read import read_bytes, sha256
+from gridworld.training.learning_curve import GREEDY, GREEDY_MORE
 from gridworld.training.tensorboard import EventWriter
 
 if TYPE_CHECKING:  # a sweep does not wait for matplotlib and Jinja
@@ -51,10 +43,13 @@ PAGE = "report.html"
 FIGURES, TABLES, EVENTS = "figures", "tables", "tensorboard"
 OVER_SEEDS = "_over_seeds"  # in a sweep's folder or a study's; TensorBoard shows it before the runs
 FORMATS = ("png", "pdf", "svg")  # of the figures
-BANDS = {  # tags of a value, its lower and its upper end
-    name: (f"{name}/{'mean' if name == 'seeds certified' else 'iqm'}", f"{name}/low", f"{name}/high")
-    for name in ("regret", "value", "on-line return", "seeds certified")
+_TAGS = {
+    **{name: f"{GREEDY}/{name}" for name in ("regret", "value")},
+    "certified": f"{GREEDY_MORE}/certified",
+    "online_return": "online/return",
 }
+# Tags of a value, its lower and its upper end: the value's is that of the runs, so that it is in their chart.
+BANDS = {name: (tag, f"over_seeds/{name}_low", f"over_seeds/{name}_high") for name, tag in _TAGS.items()}
 MARKERS = "<!-- results -->", "<!-- /results -->"
 
 _ALL_TASKS = ""  # no task's name
@@ -79,7 +74,7 @@ def check_out(folder: Path) -> None:
         raise InputError(f"--out {folder}: is not a folder; choose a new one")
     existing = next(parent for parent in folder.absolute().parents if parent.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
-        raise InputError(f"--out {folder}: {existing} cannot be written to; choose another folder")
+        raise InputError(f"--out {folder}: {existing} is not writable; choose another folder")
 
 
 def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS) -> Path:
@@ -99,20 +94,20 @@ def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS)
         for name, table in zip(_file_names(table.name for table in all_tables), all_tables, strict=True):
             write_text(new / TABLES / f"{name}.csv", to_csv(table))
             write_text(new / TABLES / f"{name}.md", to_captioned_markdown(table))
-        _write_events(report, new / EVENTS)
+        if not (folder.parent / OVER_SEEDS).exists():  # TensorBoard would show the same curves twice
+            _write_events(report, new / EVENTS)
     return folder / PAGE
 
 
-def _file_names(names: Iterable[str], blank: str = "_") -> list[str]:
+def _file_names(names: Iterable[str], unsafe: str = r"[^\w.=+-]+", instead: str = "_") -> list[str]:
     """Names that are safe for files and different from each other, even where capitals do not count."""
     out: dict[str, str] = {}  # by their small letters
     for name in names:
-        safe = re.sub(r"[^\w.,=()+ -]+", "-", name).strip(" .-")[:_LONGEST_NAME] or "unnamed"
-        safe = unique = safe.replace(" ", blank)
+        safe = unique = re.sub(unsafe, instead, name).strip(" ._-")[:_LONGEST_NAME] or "unnamed"
         count = 1
         while unique.lower() in out:
             count += 1
-            unique = f"{safe}{blank}{count}"
+            unique = f"{safe}_{count}"
         out[unique.lower()] = unique
     return list(out.values())
 
@@ -159,6 +154,8 @@ def template() -> jinja2.Template:
 
 def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
     """The page's HTML with the figures of `charts`."""
+    from gridworld.report.setting_charts import sweep_answer
+
     folders = [run.folder.absolute() for run in report.runs]
     of_one_study = (
         tuning.title
@@ -176,6 +173,7 @@ def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
         tables=tables,
         is_finite=math.isfinite,
         pictures=_pictures,
+        sweep_answer=sweep_answer,
         plain=plain,
         base64=lambda content: base64.b64encode(content).decode(),
     )
@@ -218,41 +216,42 @@ def write_over_seeds(runs: Path, folder: Path) -> Path | None:
     What is damaged is named on standard error. Returns what was made in `folder`; None where no agent has two
     seeds, there are too many runs to read them all, or none has curves for TensorBoard or can be used.
     """
-    count = sum(1 for _ in runs.glob(f"*/{MANIFEST}"))
-    if count > _MOST_READ_UNASKED or not any(runs.glob(f"*/{EVENT_FILE}")):
+    finished = sum(1 for _ in runs.glob(f"*/{SUMMARY}"))
+    if not 1 < finished <= _MOST_READ_UNASKED or not any(runs.glob(f"*/{EVENT_FILE}")):
         return None
     try:
         report = gather([runs])
         for sentence in report.damage[:MOST_SHOWN]:
             tell(sentence)
         if len(report.damage) > MOST_SHOWN:
-            tell(f"{runs}: {len(report.damage) - MOST_SHOWN} more files are damaged; the report has all")
+            tell(f"{runs}: {len(report.damage) - MOST_SHOWN} more files are damaged; the report lists all")
         if all(len(group.runs) < 2 for group in report.study.groups):
             return None
         with replacing_folder(folder / OVER_SEEDS) as new:
             _write_events(report, new)
-    except NothingFinishedError:  # who ran them has said so
-        return None
     except (InputError, OSError) as error:
-        tell(f"{folder / OVER_SEEDS}: is not written, {reason(error)}")
+        tell(f"{folder / OVER_SEEDS}: cannot be written, {reason(error)}")
         return None
     return folder / OVER_SEEDS
 
 
 def _write_events(report: Report, folder: Path) -> None:
-    results = [(task, result) for task in report.tasks for result in task.results]
-    # TensorBoard shows these names, so they keep their blanks.
-    names = _file_names((f"{result.group.agent} on {task.task}" for task, result in results), blank=" ")
-    for name, (task, result) in zip(names, results, strict=True):
-        (folder / name).mkdir(parents=True)
-        events = EventWriter(folder / name)
+    results = [
+        (task, result) for task in report.tasks for result in task.results if len(result.group.runs) > 1
+    ]
+    # TensorBoard shows these names, so they keep blanks and brackets.
+    labels = (f"{result.group.agent} on {task.task}" for task, result in results)
+    folders = [folder / name for name in _file_names(labels, r"[^\w.,=()+ -]+", "-")]
+    for of_result, (task, result) in zip(folders, results, strict=True):
+        of_result.mkdir(parents=True)
+        events = EventWriter(of_result, is_first=True)
         curves = _curves(result, task)
         events.bands("over seeds, with 95 % intervals", {name: BANDS[name] for name in curves})
-        for of, band in curves.items():
-            parts = {"iqm": band.point, "low": band.low, "high": band.high, "mean": band.mean}
-            for index, step in enumerate(band.steps.astype(np.int64).tolist()):
-                values = {f"{of}/{part}": float(numbers[index]) for part, numbers in parts.items()}
-                events.scalars({tag: value for tag, value in values.items() if math.isfinite(value)}, step)
+        for name, band in curves.items():
+            columns = (band.steps, band.point, band.low, band.high)
+            for step, *values in zip(*(column.tolist() for column in columns), strict=True):
+                points = zip(BANDS[name], values, strict=True)
+                events.scalars({tag: value for tag, value in points if math.isfinite(value)}, int(step))
         events.close()
 
 
@@ -260,10 +259,10 @@ def _curves(result: Result, task: TaskAnalysis) -> dict[str, Band]:
     """The curves by name."""
     regret, best = result.regret, task.world.optimal_value
     # The value is the optimum's minus the regret: its upper end belongs to the regret's lower one.
-    mean, point, low, high = (best - each for each in (regret.mean, regret.point, regret.high, regret.low))
-    value = dataclasses.replace(regret, point=point, mean=mean, low=low, high=high)
-    curves = {"regret": regret, "value": value, "seeds certified": result.certificates}
-    return curves if result.online is None else curves | {"on-line return": result.online}
+    point, low, high = (best - each for each in (regret.point, regret.high, regret.low))
+    value = dataclasses.replace(regret, point=point, low=low, high=high)
+    curves = {"regret": regret, "value": value, "certified": result.certificates}
+    return curves if result.online is None else curves | {"online_return": result.online}
 
 
 # ---- a README ------------------------------------------------------------------------------------------

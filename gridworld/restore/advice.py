@@ -17,12 +17,12 @@ from gridworld.config.words import conf_folder, own_conf_folders
 from gridworld.errors import InputError
 from gridworld.process.console import aligned, command
 from gridworld.restore.saved_run import SavedRun
-from gridworld.run.folder import SWEEP_JSON, RunFolder, shown
+from gridworld.run.folder import SWEEP_JSON, RunFolder, shell_path
 from gridworld.run.reader import LARGEST_RESULT, RunReader
 
 _FALLS = 0.95  # of the regret in the quarter of the curve before the last
 _FEWEST = 8  # evaluations
-_WHY = "what it costs, and why:"
+_WHY = "why it is not optimal:"
 _REPLACED = ("total_timesteps", "n_envs", "preset", "tuned")
 
 
@@ -30,7 +30,7 @@ def advice(folder: Path) -> list[str]:
     """Lines to print below the verdict on a finished run that is not certified."""
     if not RunFolder(folder).manifest_file.exists():
         return []
-    place = shlex.quote(shown(folder))
+    place = shell_path(folder)
     try:
         rows = list(_commands(SavedRun(folder), place))
     except InputError:  # it has a custom class, which is imported with trust only

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 
-from gridworld.agents import family
 from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
@@ -56,13 +55,13 @@ def lengths(then: RunReader, config: TrainConfig) -> list[int]:
         step, old = again.get("step"), again.get("instead_of")
         if type(old) is not int or type(step) is not int or old < 1:
             raise InputError(
-                f"{then.folder}: it was made longer, and its manifest does not say from what length "
-                "(resumed.instead_of), so that it cannot be repeated; was the run written by another version?"
+                f"{then.folder}: it was made longer, but its manifest does not say from what length "
+                "(resumed.instead_of); was it written by another version?"
             )
         if step < old:
             raise InputError(
-                f"{then.folder}: it got another length after {step:,} of {old:,} steps, before its end, "
-                "which cannot be repeated; only what was made longer after all of its steps can"
+                f"{then.folder}: its length was changed after {step:,} of {old:,} steps, before its end; "
+                "only a run that was made longer after its end can be repeated"
             )
         found.append(old)
     found.append(config.total_timesteps)
@@ -81,14 +80,14 @@ def population(then: RunReader) -> list[RunReader]:
         again = then.resumptions[-1]
         how = "together with others" if NUMBERS_DEPEND_ON in again else "alone"
         raise InputError(
-            f"{then.folder}: its numbers depend on other runs, and it was resumed after step "
-            f"{again.get('step')} {how}, which cannot be repeated"
+            f"{then.folder}: its numbers depend on other runs, and it was resumed {how} after step "
+            f"{again.get('step')}, which cannot be repeated"
         )
     folder = then.folder.resolve()
     if depends_on and folder.name not in depends_on:
         raise InputError(
-            f"{then.folder}: its numbers depend on {len(depends_on)} runs that its manifest names, and its "
-            "folder has the name of none of them; give it its own name again, next to the others"
+            f"{then.folder}: its numbers depend on the {len(depends_on)} runs that its manifest names, "
+            "itself included, but its folder was renamed; give it back its name, next to the others"
         )
     return [_member(then, folder.parent / name, digest) for name, digest in depends_on.items()]
 
@@ -97,15 +96,15 @@ def _member(then: RunReader, folder: Path, digest: str) -> RunReader:
     """One of the runs that `then` depends on, if it is still what it was then."""
     why = f"{then.folder}: its numbers depend on the run {folder.name}, which"
     if not (folder / MANIFEST).exists():
-        raise InputError(f"{why} is not in {folder.parent} any more; put its folder back")
+        raise InputError(f"{why} is no longer in {folder.parent}; put its folder back")
     run = read_run(folder)
     longer = [again for again in run.resumptions if again.get("total_timesteps")]
     first = longer[0].get("instead_of") if longer else run.manifest["config"].get("total_timesteps")
     settings = run.manifest["config"] | {"total_timesteps": first}
     if settings_hash(settings, "\n".join(run.manifest["layout"])) != digest:
-        raise InputError(f"{why} has other settings now; put back the one that was trained with it")
+        raise InputError(f"{why} has different settings now; put back the run that was trained with it")
     if any(str(again.get("at")) < str(then.manifest.get("ended")) for again in run.resumptions):
-        raise InputError(f"{why} was resumed from a checkpoint meanwhile; that cannot be repeated")
+        raise InputError(f"{why} has since been resumed from a checkpoint, which cannot be repeated")
     return run
 
 
@@ -124,7 +123,8 @@ def repeat(
     """
     first, *longer = lengths(then, config)
     overrides = then.manifest.get("overrides") or []
-    config = dataclasses.replace(config, total_timesteps=first)
+    logging = dataclasses.replace(config.logging, wandb=False)
+    config = dataclasses.replace(config, total_timesteps=first, logging=logging)
     own = training(config, folder, overrides, lambda env: mdp)
     if not members:
         run_alone(own)
@@ -143,10 +143,11 @@ def repeat(
 
 def _again(run: RunReader, place: Path, like: TrainConfig, trust: bool) -> Training[Summary]:
     """A run again, in a folder of its own, on the machine's part that another is trained on."""
-    settings = settings_of(run, trust)
+    settings = without_pictures(settings_of(run, trust))
     config = dataclasses.replace(
-        without_pictures(settings),
+        settings,
         total_timesteps=lengths(run, settings)[0],
+        logging=dataclasses.replace(settings.logging, wandb=False),
         device=like.device,
         threads=like.threads,
     )
@@ -177,7 +178,7 @@ def compare(then: RunReader, now: RunReader, config: TrainConfig, mdp: Mdp) -> I
     """Compare two finished runs of one configuration in one world, part by part of the result."""
 
     def weights(path: Path, most: int) -> Entries:
-        return sorted(family(config.agent).weights(path, most).items())
+        return sorted(config.agent.weights(path, most).items())
 
     def visits(run: RunReader) -> Entries:
         counts = read_visits(run, mdp.probability.shape[:2])
@@ -193,11 +194,11 @@ def compare(then: RunReader, now: RunReader, config: TrainConfig, mdp: Mdp) -> I
         before = weights(old, 2 * new.stat().st_size + _SPARE_BYTES)
         yield _finding(part, before, after, "tensors and numbers")
     yield _finding("visits", visits(then), visits(now), "counts")
-    yield _finding("summary", _summary(then), _summary(now), "entries, those of the clock aside")
+    yield _finding("summary", _summary(then), _summary(now), "entries, except timings")
     if not config.logging.tensorboard:
         return
     if next(_points(then), None) is None:
-        yield Finding("TensorBoard points", "the run's folder has no event file any more", None)
+        yield Finding("TensorBoard points", "the run's folder no longer has an event file", None)
     else:
         yield _finding("TensorBoard points", _points(then), _points(now), "points")
 

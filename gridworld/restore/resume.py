@@ -53,7 +53,7 @@ def unfinished_of(folder: Path, config: TrainConfig) -> Unfinished:
     """Read the unfinished run of these settings, to resume it with them; refused if its own differ."""
     unfinished = open_unfinished(folder, trust=True)  # its classes are those of `config`, or it is refused
     if unfinished.run.is_finished:
-        raise InputError(f"{folder}: holds a run already; give every run a folder of its own")
+        raise InputError(f"{folder}: contains a run already; choose another folder")
     own, given = (
         dict(flat(settings(each) | {"total_timesteps": each.total_timesteps}))
         for each in (unfinished.config, config)
@@ -61,12 +61,13 @@ def unfinished_of(folder: Path, config: TrainConfig) -> Unfinished:
     keys = [key for key in dict.fromkeys([*own, *given]) if own.get(key) != given.get(key)]
     differing = [f"{key}={given.get(key)} instead of {own.get(key)}" for key in keys]
     if check_settings(config).text() != unfinished.mdp.text() and not differing:
-        differing = [f"the world {config.env.name} has changed since"]
+        differing = [f"the world {config.env.name} has changed"]
     if differing:
         more = f" and {len(differing) - _NAMED} more" if len(differing) > _NAMED else ""
         raise InputError(
-            f"{folder}: holds an unfinished run with other settings ({', '.join(differing[:_NAMED])}{more}); "
-            f"choose another folder, or continue the old one by {unfinished.run.resume_command()}"
+            f"{folder}: contains an unfinished run with other settings "
+            f"({', '.join(differing[:_NAMED])}{more}); choose another folder, or resume the old one with "
+            f"{unfinished.run.resume_command()}"
         )
     return dataclasses.replace(unfinished, config=config)
 
@@ -87,13 +88,10 @@ class Unfinished:
         progress: bool = True,
         on_built: OnBuilt = ignore,
     ) -> Training[Summary]:
-        """Train to the end.
+        """Train to the end, which `total_timesteps` may set anew.
 
-        Args:
-            total_timesteps: the run's length from here on, in environment steps; None: as it was.
-            anyway: accept an environment in which the last bits of the numbers may differ.
-            progress: show progress, where the run's settings do so.
-            on_built: takes the agent before it learns.
+        `anyway` accepts an environment in which the last bits of the numbers may differ; progress is shown
+        where the run's settings do so, too; `on_built` takes the agent before it learns.
         """
         run, folder, old_total = self.run, self.run.folder, self.config.total_timesteps
         total = old_total if total_timesteps is None else total_timesteps
@@ -106,7 +104,7 @@ class Unfinished:
         with TrainLog() as log:
             if total_timesteps is None and run.is_finished and Checkpoints(folder).files():
                 raise InputError(
-                    f"{folder}: is finished; to make it longer, say how long: {_resume_command(run)} "
+                    f"{folder}: is finished; to make it longer:  {_resume_command(run)} "
                     f"total_timesteps={2 * old_total}"
                 )
             mdp = check_settings(config, lambda env: self.mdp)
@@ -122,11 +120,11 @@ class Unfinished:
         """Start again, which a finished run is too good for."""
         if self.run.is_finished:
             raise InputError(
-                f"{self.run.folder}: is finished, and {CHECKPOINTS}/ has no checkpoint to continue from; for "
-                f"{config.total_timesteps:,} steps begin a new run in another folder"
+                f"{self.run.folder}: is finished, but {CHECKPOINTS}/ has no checkpoint to continue from; "
+                f"start a new run of {config.total_timesteps:,} steps in another folder"
             )
         if config.total_timesteps != self.config.total_timesteps or self.run.curve_file.exists():
-            tell(f"{self.run.folder}: has no checkpoint yet; begins anew")
+            tell(f"{self.run.folder}: has no checkpoint yet; it starts over")
         overrides = self.run.manifest.get("overrides", [])
         return RunWriter.start(self.run.folder, dataclasses.asdict(config), self.mdp, overrides, replace=True)
 
@@ -139,17 +137,20 @@ class Unfinished:
         differs = [f"{key} {then.get(key)} is now {now.get(key)}" for key in keys]
         if differs and not anyway:
             raise InputError(
-                f"{folder}: was begun in another environment ({'; '.join(differs)}), where numbers may "
-                f"differ; continue it there, or by {_resume_command(run)} anyway=true, which is noted"
+                f"{folder}: was started in another environment ({'; '.join(differs)}), so numbers may "
+                f"differ; resume it there, or anyway with {_resume_command(run)} anyway=true"
             )
         if (total != old_total and total < steps) or (run.is_finished and total <= old_total):
             raise InputError(
-                f"total_timesteps={total}: {folder} has come to {steps:,} of {old_total:,} steps; "
-                "it can be made longer, not shorter"
+                f"total_timesteps={total}: {folder} has done {steps:,} of {old_total:,} steps; it can be "
+                "made longer, not shorter"
             )
-        tell(f"{folder}: goes on after {steps:,} of {total:,} steps")
+        tell(f"{folder}: resumes after {steps:,} of {total:,} steps")
         if changes := list(source_differences(run.git, git())):
-            tell(f"{folder}: the source tree is another, which is noted: {printable('; '.join(changes))}")
+            tell(
+                f"{folder}: the source code has changed, as its manifest will say:  "
+                f"{printable('; '.join(changes))}"
+            )
         if total != old_total:
             agent = flat(dataclasses.asdict(config.agent))
             scheduled = [key for key, value in agent if falls(value) or (value and key.endswith("_fraction"))]
@@ -173,8 +174,8 @@ class Unfinished:
             changed = True
         if changed:
             tell(
-                f"{self.run.folder}: its world {env.name} has changed since; it continues with the one that "
-                "it began with"
+                f"{self.run.folder}: its world {env.name} has changed; the run continues with its original "
+                "world"
             )
 
 
@@ -188,15 +189,15 @@ def _newest_state(run: RunReader, own: str) -> State | None:
     for path, state in Checkpoints(run.folder).states():
         reason = _why_not(path, state, run.folder, own)
         if reason is None and lengthened and state["steps"] < lengthened[-1]:  # type: ignore[index]
-            reason = f"it is from before the run was made longer, after {lengthened[-1]:,} steps"
+            reason = f"it is older than the lengthening after {lengthened[-1]:,} steps"
         if reason is None:
             assert isinstance(state, dict)
             return state
-        tell(f"{path}: passed over, {reason}")
+        tell(f"{path}: skipped, {reason}")
     if lengthened:
         raise InputError(
             f"{run.folder}: was made longer after {lengthened[-1]:,} steps and has no checkpoint left from "
-            "then on; begun anew it would end otherwise: start a new run"
+            "then on, so it cannot be resumed exactly; start a new run"
         )
     return None
 
@@ -206,20 +207,20 @@ def _why_not(path: Path, state: State | StateError, folder: Path, own: str) -> s
     if isinstance(state, StateError):
         return str(state)
     if state.get("format") != FORMAT:
-        return "another version of gridworld wrote it"
+        return "it was written by another version of gridworld"
     if {key: type(value) for key, value in state.items()} != CONTENT or state["marks"].keys() != LOGS.keys():
-        return "it lacks what a checkpoint has"
+        return "parts of a checkpoint are missing"
     if state["identity"] != own:
-        return "it is of another run"
+        return "it belongs to another run"
     if steps_of(path) != state["steps"] or not 0 < state["steps"] <= MOST_STEPS:
-        return "it is not of as many steps as its name says, or of more than a run can have"
+        return "its number of steps differs from its name, or exceeds the run's"
     if not math.isfinite(state["seconds"]):
-        return "it took an impossible number of seconds"
+        return "its training time is impossible"
     for name, mark in state["marks"].items():
         if not holds(folder, mark, LOGS[name]) and not (name == "events" and mark is None):
-            return f"the file of the {name} is not what it was then"
+            return f"the file of the {name} has changed since"
     with open_ordinary(folder / CURVE) as file:
         header = file.readline(_LONGEST_HEADER).decode(errors="replace").rstrip("\n")
     if tuple(header.split(",")) != CURVE_COLUMNS:
-        return "the curve has other columns than this version of gridworld writes"
+        return "the curve's columns differ from this version's"
     return None

@@ -16,11 +16,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import Agent, PolicySnapshot, family
+from gridworld.agents import Agent, PolicySnapshot
 from gridworld.config.settings import check_foreign, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import MapConfig
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.console import tell
 from gridworld.process.user_input import DAMAGED, limited
@@ -38,12 +37,9 @@ _UNDECODED = frozenset(map(chr, range(0xDC80, 0xDD00)))  # bytes of a path that 
 
 
 class SavedRun:
-    """A finished run with its settings and its world.
+    """A finished run with its settings, its world and its agent, at the end or at its `best` on the way.
 
-    Args:
-        folder: the run's folder.
-        trust: import the classes that the settings name, wherever they are from.
-        best: take the agent with the lowest regret on the way, not the one at the end.
+    With `trust`, the classes that the settings name are imported, wherever they are from.
     """
 
     @limited()
@@ -69,8 +65,8 @@ class SavedRun:
         kept = list(words) if self._trust else list(harmless_words(words, self.config))
         if left_out := len(words) - len(kept):
             tell(
-                f"{shown(self.run.folder)}: {left_out} of the {len(words)} words of its command line may run "
-                "code or lead elsewhere, and are not repeated; if you trust the run, say so"
+                f"{shown(self.run.folder)}: {left_out} of the {len(words)} words of its command line may "
+                "run code or leave its folder, and are omitted; open the run with trust to keep them"
             )
         return kept
 
@@ -86,7 +82,7 @@ class SavedRun:
             if (world.num_rows, world.num_cols) != (rows, columns):
                 raise InputError(
                     f"layout {world.name}: is {world.num_rows}x{world.num_cols}, the agent was trained on "
-                    f"{rows}x{columns}; take a map of that size"
+                    f"{rows}x{columns}; use a map of that size"
                 )
             mdp = env.compile_on(world)
         return Evaluator(mdp, self.config.evaluation.gamma, env.step_limit(mdp))
@@ -99,12 +95,10 @@ class SavedRun:
     @limited()
     def agent(self) -> Agent:
         """The trained agent, a new object at every call."""
-        shows = self.config.observation
-        observation = make_observation(self.mdp, shows.kind, shows.cell_size)
         self.run.verify(self._model_file)
         few = dataclasses.replace(self.config, n_envs=min(self.config.n_envs, 2), callbacks=[])
-        context = dataclasses.replace(make_context(few, self.mdp, observation), only_asked=True)
-        agent = family(self.config.agent).build(self.config.agent, context)
+        context = dataclasses.replace(make_context(few, self.mdp), only_asked=True)
+        agent: Agent = self.config.agent.build(context)
         agent.load(self._model_file)
         return agent
 
@@ -135,7 +129,7 @@ def settings_of(
             callbacks = config.callbacks if trains else []
             used = {"agent": dataclasses.asdict(config.agent), "callbacks": callbacks}
             check_foreign(used, str(run.manifest_file), allow)
-        family(config.agent).check(config)
+        config.agent.check(config)
     except RecursionError:
         raise InputError(f"{run.manifest_file}: config is nested too deeply") from None
     return config

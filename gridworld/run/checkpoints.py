@@ -34,15 +34,11 @@ def steps_of(path: Path) -> int:
 
 
 class Checkpoints:
-    """The checkpoints in a run's folder.
-
-    Attributes:
-        newest: environment steps at the newest one that this process wrote or resumed from; None: none.
-    """
+    """The checkpoints in a run's folder."""
 
     def __init__(self, run_folder: Path) -> None:
         self.folder = run_folder / CHECKPOINTS
-        self.newest: int | None = None
+        self.newest: int | None = None  # steps at the one that this process wrote last, or resumed from
 
     def save(self, steps: int, state: State, durable: bool = True, small: bool = False) -> None:
         """Write the state after so many environment steps, and remove the oldest checkpoint.

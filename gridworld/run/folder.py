@@ -90,7 +90,7 @@ class RunFolder:
         """The command line that resumes the run; for settings that the user has `trusted`, it says so."""
         parts = {key: (trusted or {}).get(key) for key in ("agent", "callbacks")}  # that are built again
         trust = " trust=true" if any(foreign(parts)) else ""
-        return f"{command('train')} resume={shlex.quote(shown(self.folder))}{trust}"
+        return f"{command('train')} resume={shell_path(self.folder)}{trust}"
 
 
 def shown(folder: Path) -> str:
@@ -101,6 +101,11 @@ def shown(folder: Path) -> str:
         return printable(str(folder))
 
 
+def shell_path(folder: Path) -> str:
+    """The same, quoted where a shell needs it."""
+    return shlex.quote(shown(folder))
+
+
 def check_inside(path: Path, key: str) -> None:
     """Refuse a relative path that leads out of the current folder; `key` is the option that has it."""
     normal = os.path.normpath(path)
@@ -109,7 +114,7 @@ def check_inside(path: Path, key: str) -> None:
     if normal == os.curdir:
         raise InputError(f"{key}={path}: is the current folder; name one in it, e.g. runs/mine")
     raise InputError(
-        f"{key}={path}: leads out of the current folder; if that is meant, say {os.path.abspath(path)}"
+        f"{key}={path}: leads out of the current folder; if you mean that, write {os.path.abspath(path)}"
     )
 
 
@@ -123,35 +128,40 @@ def check_writable(folder: Path, key: str) -> None:
 
 
 @contextlib.contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Hold a run's folder for this process; an `InputError` if another process holds it."""
-    with locked(folder / LOCK, wait=0) as is_ours:
+def alone_in(folder: Path, wait: float = 0) -> Iterator[None]:
+    """Hold a folder for this process, and remove what one that died has left half written.
+
+    Raises `InputError` if another process still holds it after `wait` seconds.
+    """
+    with locked(folder / LOCK, wait) as is_ours:
         if not is_ours:
-            raise InputError(f"{shown(folder)}: another process is at work in it; wait for it or stop it")
+            raise InputError(f"{shown(folder)}: another process is using it; wait for it or stop it")
+        tidy(folder)
         yield
 
 
 @contextlib.contextmanager
-def claimed(folder: Path) -> Iterator[None]:
-    """Make a run's folder and hold it for this process; afterwards, undo that where no run was started.
+def claimed(folder: Path, begun: str = MANIFEST, alone: bool = True) -> Iterator[None]:
+    """Make a folder and hold it for this process; afterwards, undo that unless it has the file `begun`.
 
-    An `OSError` of the block names the folder, if it names nothing.
+    Where others may work in it too, it is not `alone`. An `OSError` of the block names the folder, if it
+    names nothing.
     """
     is_first = not folder.parent.exists()
     make_folder(folder.parent)
     folder.mkdir(exist_ok=True)
-    with alone_in(folder):
+    with alone_in(folder) if alone else contextlib.nullcontext():
         try:
             yield
         except OSError as error:
             error.filename = error.filename or shown(folder)  # a failed write names no file
             raise
         finally:
-            # Remove what Hydra wrote for a run that never started.
             with contextlib.suppress(OSError):
-                if not (folder / MANIFEST).exists():
+                if not (folder / begun).exists():
                     tidy(folder)
-                    remove_path(inside(folder, HYDRA))
+                    if begun == MANIFEST:  # what Hydra wrote for a run that never started
+                        remove_path(inside(folder, HYDRA))
                     (folder / LOCK).unlink(missing_ok=True)
                     folder.rmdir()
                     if is_first:

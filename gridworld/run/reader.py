@@ -105,12 +105,12 @@ class RunReader(RunFolder):
         if noted is None:
             raise InputError(
                 f"{self.manifest_file}: has no checksum (sha256) of {path.name}; was the run written by "
-                "another version, or the file added to it?"
+                "another version, or the file added later?"
             )
         if digest != noted:
             raise InputError(
-                f"{path}: is not the file that the run wrote, its checksum is not the one in {MANIFEST}; "
-                "it was damaged or changed"
+                f"{path}: is not the file that the run wrote: its checksum differs from {MANIFEST}; it was "
+                "damaged or changed"
             )
 
 
@@ -119,7 +119,7 @@ def open_run(folder: Path) -> RunReader:
     run = read_run(folder)
     if not run.is_finished:
         raise InputError(
-            f"{folder}: this run is {run.manifest['status']!r}; only a finished one can be looked at"
+            f"{folder}: this run is {run.manifest['status']!r}; only finished runs can be opened"
         )
     return run
 
@@ -174,15 +174,15 @@ def check_free(folder: Path, key: str = "hydra.run.dir") -> None:
     except InputError:  # there is none, or its manifest is damaged
         is_finished = False
     if is_finished:
-        longer = f", or make that run longer by {RunFolder(folder).resume_command()} total_timesteps=..."
+        longer = f", or make that run longer with {RunFolder(folder).resume_command()} total_timesteps=..."
         can_be_longer = any(folder.glob(f"{CHECKPOINTS}/*"))
         raise InputError(
-            f"{folder}: holds a run already; choose another folder{longer if can_be_longer else ''}"
+            f"{folder}: contains a run already; choose another folder{longer if can_be_longer else ''}"
         )
     if (folder / SWEEP_JSON).exists():
         raise InputError(f"{folder}: is the folder of a sweep; choose another {key}")
     if used := next(folder.glob(f"*/{MANIFEST}"), None):
-        raise InputError(f"{folder}: holds other runs, {used.parent} for one; name a new folder in it")
+        raise InputError(f"{folder}: contains other runs, such as {used.parent}; name a new folder in it")
     check_no_link(folder / CHECKPOINTS)
     check_writable(folder, key)
 
@@ -237,18 +237,18 @@ _RESUMPTION = "resumption"
 _COUNT = (int | None, "a number of steps")
 _ENTRIES: dict[str, tuple[Any, str]] = {
     "status": (str, "a word"),
-    "config": (dict, "the run's settings; is it of another version?"),
-    "layout": ([str], "a list of the map's rows; is it of another version?"),
+    "config": (dict, "the run's settings; was it written by another version?"),
+    "layout": ([str], "a list of the map's rows; was it written by another version?"),
     "started": (str, "a date"),
     "ended": (str | None, "a date"),
     "error": (str, "a sentence"),
-    "overrides": ([str], "a list of what stood on the command line"),
+    "overrides": ([str], "the words of a command line"),
     "sha256": ({}, "a checksum for each file"),
     "resumed": (
         [_RESUMPTION],
-        "a list of when the run went on, with the step after which it was made longer",
+        "a list of resumptions, with their steps",
     ),
-    NUMBERS_DEPEND_ON: ({}, "a hash for each run, by the name of a folder beside this one"),
+    NUMBERS_DEPEND_ON: ({}, "a hash for each run, by the name of its folder"),
     "reached": _COUNT,
     "checkpoint": _COUNT,
     "versions": (dict, "a version for each package"),

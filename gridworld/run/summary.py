@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shlex
+import itertools
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +10,8 @@ from typing import Any
 
 from gridworld.process.console import aligned, printable
 from gridworld.process.signals import Interrupted
-from gridworld.run.folder import EVENTS, RunFolder, shown
+from gridworld.process.user_input import users_folder
+from gridworld.run.folder import EVENTS, RunFolder, shell_path
 from gridworld.run.reader import read_run
 from gridworld.world.metrics import METRICS
 
@@ -18,6 +19,7 @@ Summary = dict[str, Any]
 
 MOST_NAMED = 5  # states of a policy that loops
 _ROUNDING = 1e-9  # of a probability
+_MOST_SELECTED = 40  # runs: of more TensorBoard selects none
 
 
 def train_and_tell(
@@ -30,23 +32,31 @@ def train_and_tell(
         run = read_run(folder)
         print(interruption_text(interruption, run, run.manifest), file=sys.stderr)
         sys.exit(interruption.exit_code)
-    place = shlex.quote(shown(folder))
+    place = shell_path(folder)
     print(summary_text(summary, place, [] if summary["certified"] else advise(folder)))
     if any(folder.glob(EVENTS)):
-        print(printable(f"  curves: tensorboard --logdir {place}"), flush=True)
+        print(f"  curves: tensorboard --logdir {shell_path(_logs(folder.absolute()))}", flush=True)
     return summary
+
+
+def _logs(folder: Path) -> Path:
+    """What TensorBoard is to show of a run: the folder above, since it calls a run that is alone "."."""
+    above = folder.parent
+    beside = itertools.chain(above.glob(f"*/{EVENTS}"), above.glob(f"*/*/{EVENTS}"))
+    are_few = len(list(itertools.islice(beside, _MOST_SELECTED + 1))) <= _MOST_SELECTED
+    return above if are_few and above != users_folder() else folder
 
 
 def interruption_text(interruption: Interrupted, run: RunFolder, manifest: Mapping[str, Any]) -> str:
     """How much of an interrupted run is saved, by its manifest, and the command that resumes it."""
     saved, reached = manifest.get("checkpoint"), manifest.get("reached")
     if not saved:
-        what = "nothing is saved, so that it will begin anew"
+        what = "nothing is saved, so it will start over"
     elif saved == reached:
         what = f"all {saved:,} steps are saved"
     else:
-        what = f"saved are {saved:,} of its {reached:,} steps"
-    return printable(f"{interruption}: {what}; go on with  {run.resume_command(manifest['config'])}")
+        what = f"{saved:,} of its {reached:,} steps are saved"
+    return printable(f"{interruption}: {what}; resume with  {run.resume_command(manifest['config'])}")
 
 
 def summary_text(summary: Summary, folder: str, advice: Sequence[str] = ()) -> str:
@@ -95,7 +105,7 @@ def _trade(name: str, summary: Summary) -> str:
     if name != "goal_probability" or summary["certified"]:
         return ""
     is_above = summary[name] > summary[f"optimal_{name}"] + _ROUNDING
-    return "  more often than the optimum, for less value" if is_above else ""
+    return "  more often than the optimum, but with less value" if is_above else ""
 
 
 def verdict(summary: Summary) -> str:

@@ -64,7 +64,7 @@ class RunWriter(RunFolder):
         }
         run = cls(folder, content)
         if not replace and run.manifest_file.exists():
-            raise InputError(f"{folder}: holds a run already; give every run a folder of its own")
+            raise InputError(f"{folder}: contains a run already; choose another folder")
         (clear if replace else _remove_partial_files)(folder)
         if not isinstance(world, GridMdp):
             write_bytes(run.world_file, world_bytes(world), durable=replace)

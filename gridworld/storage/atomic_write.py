@@ -212,12 +212,9 @@ def check_no_links(top: Path, *names: str) -> None:
 class AppendLog:
     """An append-only file that is open for writing. Nothing is buffered: readers see each record at once.
 
-    The file also is the witness that the folder is still this process's: if somebody deleted it, and began
-    anew at the same path, whatever writes here raises `FolderLostError`.
-
-    Args:
-        path: of a new file, or with `mark` of an existing one.
-        mark: to which an existing file is truncated; check it by `holds` before.
+    It is a new file, or with a `mark`, which `holds` has checked, an existing one truncated to that. The file
+    also is the witness that the folder is still this process's: if somebody deleted it, and began anew at the
+    same path, whatever writes here raises `FolderLostError`.
     """
 
     def __init__(self, path: Path, mark: dict[str, Any] | None = None) -> None:
@@ -274,7 +271,7 @@ class AppendLog:
         """Refuse to continue where the file at this path is not this one any more."""
         opened = os.fstat(self._file.fileno())
         if not os.path.lexists(self.path) or not os.path.samestat(os.lstat(self.path), opened):
-            raise FolderLostError(f"{self.path}: was deleted or replaced during the run, which ends here")
+            raise FolderLostError(f"{self.path}: was deleted or replaced during the run, which stops here")
 
 
 def holds(folder: Path, mark: Any, pattern: str) -> bool:

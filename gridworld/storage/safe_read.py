@@ -104,7 +104,7 @@ def as_object(content: bytes, path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is not JSON, it was changed or cut off ({error})") from None
     if not isinstance(found, dict):
-        raise InputError(f"{path}: holds no JSON object")
+        raise InputError(f"{path}: must be a JSON object")
     if _is_deeper(found, _DEEPEST):
         raise InputError(f"{path}: is nested too deeply, more than {_DEEPEST} levels")
     return found
@@ -113,7 +113,7 @@ def as_object(content: bytes, path: Path) -> dict[str, Any]:
 def _number(text: str) -> float:
     number = float(text)
     if not math.isfinite(number):
-        raise ValueError(f"{text[:20]} is too large a number, or none")
+        raise ValueError(f"{text[:20]} is too large, or not a number")
     return number
 
 
@@ -146,7 +146,7 @@ def read_sealed(path: Path) -> dict[str, Any]:
         )
     if content.get("seal") != _seal(content):
         raise InputError(
-            f"{path}: was changed or damaged, its seal is not that of its content; put back a good copy"
+            f"{path}: was changed or damaged: its seal does not match its content; restore a good copy"
         )
     return content
 

@@ -14,6 +14,7 @@ import random
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -56,13 +57,13 @@ def decode(data: bytes | memoryview, name: object = "a state") -> State:
         members: dict[str, Any] = npz_arrays(name, data, "a state", _MOST)
         tree = members.pop(_TREE)
         check_memory(name, AS_JSON * len(tree))
-        state = _unfold(json.loads(tree), members)
+        state = json.loads(tree, object_hook=partial(_array_or_mapping, members))
     except BudgetError:
         raise
     except InputError as error:
         raise StateError(str(error).removeprefix(f"{name}: ")) from None
     except (ValueError, TypeError, LookupError, RecursionError) as error:
-        raise StateError(f"its content makes no sense ({type(error).__name__})") from None
+        raise StateError(f"its content is invalid ({type(error).__name__})") from None
     if not isinstance(state, dict):
         raise StateError("its content is not a state")
     return state
@@ -113,16 +114,12 @@ def _fold(node: Any, arrays: dict[str, NDArray[Any]], where: str) -> Any:
     raise TypeError(f"{where}: a {type(node).__name__} is not part of a state")
 
 
-def _unfold(node: Any, arrays: dict[str, NDArray[Any]]) -> Any:
-    if isinstance(node, list):
-        return [_unfold(value, arrays) for value in node]
-    if not isinstance(node, dict):
+def _array_or_mapping(arrays: dict[str, Any], node: dict[str, Any]) -> Any:
+    if _ARRAY not in node:
         return node
-    if _ARRAY in node:
-        if len(node) != 1 or not isinstance(array := arrays[node[_ARRAY]], np.ndarray):
-            raise ValueError
-        return array
-    return {key: _unfold(value, arrays) for key, value in node.items()}
+    if len(node) != 1 or not isinstance(array := arrays[node[_ARRAY]], np.ndarray):
+        raise ValueError
+    return array
 
 
 def independent_generator(seed: int) -> np.random.Generator:

@@ -21,10 +21,11 @@ from gridworld.config.settings import ON_RESULT, effect_of, flat, with_effects
 from gridworld.envs.rollout import wilson_interval
 from gridworld.errors import InputError
 from gridworld.process.console import aligned, command, command_line, duration, printable
+from gridworld.run.folder import shell_path
 from gridworld.run.reader import read_run
 from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
 
-_HEADINGS = ("agent", "task", "settings", "certified", "steps to certificate, median")
+_HEADINGS = ("agent", "task", "settings", "certified", "median steps")
 _OF_SETTINGS = ON_RESULT - {Effect.SEED, Effect.LABELS, Effect.MACHINE}
 _MOST_NAMED = 3  # jobs
 _LONGEST = 60  # characters of settings
@@ -63,9 +64,9 @@ def tell_end(
     elif any(row.job not in mistakes for row in failed):
         lines.append(f"to try them again: {resume_command(folder, 'hydra.sweeper.retry_failed=true')}")
     elif any(row.status == RUNNING for row in rows):
-        lines.append(f"the rest runs elsewhere; to see how it goes: {resume_command(folder)}")
+        lines.append(f"the rest runs elsewhere; to see its progress:  {resume_command(folder)}")
     elif any(row.status not in (DONE, FAILED) for row in rows):
-        lines.append(f"the rest did not come to its end; resume with: {resume_command(folder)}")
+        lines.append(f"the rest did not finish; resume with: {resume_command(folder)}")
     for line in lines:
         print(printable(line), file=sys.stderr, flush=True)
 
@@ -82,13 +83,6 @@ def resume_command(folder: Path, *more: str) -> str:
     if not any(word.startswith("hydra.sweep.dir=") for word in words):
         more = (f"hydra.sweep.dir={folder}", *more)
     return printable(shlex.join([*words, *(word for word in more if word not in words)]))
-
-
-def shell_path(folder: Path) -> str:
-    """The folder as a user would type it here, quoted where a shell needs it."""
-    path = folder.absolute()
-    here = Path.cwd()
-    return printable(shlex.quote(str(path.relative_to(here) if path.is_relative_to(here) else path)))
 
 
 def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
@@ -114,7 +108,7 @@ def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
     lines = aligned([[f"{cell} " for cell in row] for row in table], forms)  # two blanks between columns
     if lost:
         named = f"{', '.join(lost[:_MOST_NAMED])}{', ...' if len(lost) > _MOST_NAMED else ''}"
-        lines[0] += f"; {len(lost)} of {len(rows)} jobs are not counted: {named}"
+        lines.append(f"{len(lost)} of {len(rows)} jobs are not counted: {named}")
     return lines
 
 

@@ -22,15 +22,13 @@ from typing import Any
 
 from gridworld.errors import InputError
 from gridworld.process.console import recorded_command_line
-from gridworld.run.folder import ERROR_FILE, HYDRA, LOCK, MANIFEST, SWEEP_JSON, check_writable
+from gridworld.run.folder import ERROR_FILE, HYDRA, LOCK, MANIFEST, SWEEP_JSON, alone_in, check_writable
 from gridworld.run.provenance import settings_hash, versions
 from gridworld.run.reader import RunReader, find_run
 from gridworld.storage.atomic_write import (
     check_no_links,
     is_locked,
-    locked,
     make_folder,
-    tidy,
     write_json,
     write_text,
 )
@@ -83,8 +81,8 @@ class SweepFolder:
             self._load(path / SWEEP_JSON)
         elif used := next(iter(sorted(path.glob(f"*/{MANIFEST}"))), None):
             raise InputError(
-                f"{path}: has no {SWEEP_JSON}, but {used.parent} holds a run already; "
-                "choose another hydra.sweep.dir"
+                f"{path}: has no {SWEEP_JSON}, but {used.parent} contains a run; choose another "
+                "hydra.sweep.dir"
             )
 
     def check(self, jobs: Sequence[Job], extend: bool) -> None:
@@ -97,8 +95,8 @@ class SweepFolder:
         if self.entries and not extend and not common:
             asked = shlex.join(self._asked[-1]["overrides"])
             raise InputError(
-                f"{self.path}: holds the sweep '{asked}', which has no job in common with this one; choose "
-                "another hydra.sweep.dir, or add hydra.sweeper.extend=true to put both into one"
+                f"{self.path}: contains the sweep '{asked}', which has no job in common with this one; "
+                "choose another hydra.sweep.dir, or merge them with hydra.sweeper.extend=true"
             )
 
     @contextlib.contextmanager
@@ -108,11 +106,8 @@ class SweepFolder:
             make_folder(self.path)
         except OSError as error:
             raise InputError(f"{self.path}: cannot be made ({error.strerror})") from None
-        with locked(self.path / LOCK, wait=1) as is_ours:
-            if not is_ours:
-                raise InputError(f"{self.path}: another process runs this sweep; wait for it or stop it")
+        with alone_in(self.path, wait=1):
             (self.path / STOP).unlink(missing_ok=True)
-            tidy(self.path)
             yield
 
     def add(self, jobs: Sequence[Job], words: Sequence[str]) -> list[JobEntry]:
@@ -169,12 +164,12 @@ class SweepFolder:
                 self.entries[digest] = JobEntry(job, digest, _words(item["overrides"]))
             names = {entry.job.lower() for entry in self.entries.values()}
             if not len(content["jobs"]) == len(self.entries) == len(names):
-                raise ValueError("two jobs have one folder, or one hash")
+                raise ValueError("two jobs have the same folder or hash")
         except (ValueError, LookupError, TypeError, AttributeError) as error:  # an `InputError` is one
             what = str(error) if isinstance(error, ValueError) else "a part is missing"
             what = what.removeprefix(f"{file}: ")
             raise InputError(
-                f"{file}: damaged ({what}); put back a good copy, or choose another hydra.sweep.dir"
+                f"{file}: damaged ({what}); restore a good copy, or choose another hydra.sweep.dir"
             ) from None
 
 
@@ -231,8 +226,8 @@ def _other_job(manifest: dict[str, Any], entry: JobEntry) -> str:
         lengths = [again["total_timesteps"] for again in manifest["resumed"] if "total_timesteps" in again]
     except (KeyError, TypeError, AttributeError):
         lengths = []
-    what = f"was made {lengths[-1]} steps long" if lengths else "has other settings than the job"
-    return f"the run in {entry.job} {what}, so that it is not this job's result; move it to keep it"
+    what = f"was made {lengths[-1]} steps long" if lengths else "has different settings from the job"
+    return f"the run in {entry.job} {what}, so it is not this job's result; move it to keep it"
 
 
 def _first_line(file: Path) -> str:

@@ -18,7 +18,6 @@ import yaml
 from hydra.core.utils import JobReturn, JobStatus, configure_log
 from omegaconf import DictConfig, OmegaConf
 
-from gridworld.agents import family
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.process.console import prepare
@@ -117,7 +116,7 @@ class Worker:
         configure_log(self.master.hydra.job_logging, self.master.hydra.verbose)
         config = jobs[0].config  # all have one device
         asked = self.master.hydra.sweeper.population != AUTO and len(jobs) > 1
-        depend = asked and not family(config.agent).on_processor(config.device)
+        depend = asked and not config.agent.on_processor(config.device)
         with mixing({job.folder.name: job.hash for job in jobs} if depend else {}):
             results = run_together([self._run(job) for job in jobs])
         return [one_line(reason(result)) if isinstance(result, Exception) else "" for result in results]

@@ -30,7 +30,6 @@ from omegaconf.errors import OmegaConfBaseException
 from gridworld.config.compose import drop_hydra, to_config
 from gridworld.config.presets import with_preset
 from gridworld.config.settings import foreign, has_own_code
-from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.config.words import prepared
 from gridworld.config.worlds import EnvConfig
@@ -109,7 +108,7 @@ def expand(
             axes.append([dict(zip(group, values, strict=True)) for values in together])
     if math.prod(map(len, axes)) > most:
         raise InputError(
-            f"{' '.join(words)}: more than {most:,} jobs; if so many are meant, raise hydra.sweeper.max_jobs"
+            f"{' '.join(words)}: more than {most:,} jobs; if you mean that, raise hydra.sweeper.max_jobs"
         )
     found = []
     for parts in itertools.product(*axes):
@@ -121,10 +120,10 @@ def expand(
 def _values(override: Override, most: int) -> list[str]:
     """The values of a swept key, one too many where there are more than `most`."""
     if not override.is_discrete_sweep():
-        raise InputError(f"{override.input_line}: jobs are made of a list, a,b,c, or of range(start, stop)")
+        raise InputError(f"{override.input_line}: a sweep takes a list, a,b,c, or range(start, stop)")
     values = list(itertools.islice(override.sweep_string_iterator(), most + 1))
     if not values:
-        raise InputError(f"{override.input_line}: there is nothing in it, so there would be no job")
+        raise InputError(f"{override.input_line}: is empty, so there are no jobs")
     return values
 
 
@@ -138,13 +137,13 @@ def _groups(paired: Sequence[Any], swept: Mapping[str, list[str]]) -> list[list[
         where = f"hydra.sweeper.paired=[{','.join(names)}]"
         for name in names:
             if name not in by_name:
-                raise InputError(f"{where}: {name} has no list of values; give it one, {name}=A,B")
+                raise InputError(f"{where}: {name} has no list of values; add {name}=A,B")
         keys = [key for key in swept if key in {by_name[name] for name in names}]
         if len(keys) < max(2, len(names)) or set(keys) & set(itertools.chain(*found)):
             raise InputError(f"{where}: must name two settings or more, such as [agent,n_envs], each once")
         if len({len(swept[key]) for key in keys}) > 1:
             counts = ", ".join(f"{name} has {len(swept[by_name[name]])}" for name in names)
-            raise InputError(f"{where}: lists that vary together are equally long; {counts} values")
+            raise InputError(f"{where}: lists that vary together must have equal lengths; {counts} values")
         found.append(keys)
     return found
 
@@ -164,8 +163,8 @@ class Configurations:
         subdir = self._shared["sweep"]["subdir"]
         if subdir != _NUMBERED:
             raise InputError(
-                f"hydra.sweep.subdir={subdir}: a sweep names the folders of its jobs itself, by the settings "
-                "in which they differ; leave it out"
+                f"hydra.sweep.subdir={subdir}: a sweep names the folders of its jobs by their settings; "
+                "leave it out"
             )
         HydraConfig.instance().set_config(master)  # settings may refer to it: ${hydra:runtime.cwd}
         self._base = functools.lru_cache(maxsize=_MOST_BASES)(self._by_hydra)
@@ -191,8 +190,8 @@ class Configurations:
         for key, value in _shared(whole).items():
             if value != self._shared[key]:
                 raise InputError(
-                    f"hydra.{key}: is set in a file that only some of the jobs choose, and all jobs of a "
-                    "sweep have it in common; choose that file for all, or give it on the command line"
+                    f"hydra.{key}: is set by only some of the jobs, but all jobs of a sweep share it; give "
+                    "it on the command line"
                 )
         return drop_hydra(whole)
 
@@ -252,7 +251,7 @@ def plan(
         first = planned.setdefault(digest, job)
         if other := [word for word in swept if word not in first.swept]:
             shown = " ".join(word for word in first.swept if word not in swept)
-            note = f"{' '.join(other)} makes the same runs as {shown}, and these are run once"
+            note = f"{' '.join(other)} repeats the runs of {shown}; they run once"
             planned[digest] = dataclasses.replace(first, notes=(*first.notes, note))
     return list(planned.values())
 
@@ -263,13 +262,12 @@ def runs_apart(launcher: str, config: TrainConfig) -> bool:
 
 
 def populations(
-    jobs: Sequence[Job], settings: SweepConfig, launcher: str, own: Mapping[str, Any], hydra: DictConfig
+    jobs: Sequence[Job], most: int | None, launcher: str, own: Mapping[str, Any]
 ) -> list[list[Job]]:
-    """Divide jobs into populations."""
+    """Divide jobs into populations of at most so many; None: as many as train faster, and memory holds."""
     shapes: dict[str, list[Job]] = {}
     for job in jobs:
         shapes.setdefault(job.hash if job.shape is None else f"shape {job.shape}", []).append(job)
-    most = 1 if runs_in_turn(settings, hydra) else _most(settings)
     found = []
     for members in shapes.values():
         workers = worker_count(own["n_jobs"]) if runs_apart(launcher, members[0].config) else 1
@@ -288,19 +286,13 @@ def populations(
     return found
 
 
-def runs_in_turn(settings: SweepConfig, hydra: DictConfig) -> bool:
-    """Whether jobs cannot train together: the first failure counts, or each has a current folder."""
-    return bool(settings.stop_at_first_failure or hydra.job.chdir)
-
-
-def _most(settings: SweepConfig) -> int | None:
-    """The largest population that is asked for; None: as many as train faster, and memory holds."""
-    asked = settings.population
+def largest_population(asked: object) -> int | None:
+    """The largest population by the setting, or None. Raises `InputError`."""
     if asked == AUTO:
         return None
     if type(asked) is int and asked >= 1:
         return asked
     raise InputError(
-        f"hydra.sweeper.population={asked}: must be the number of runs that train together at most, 1 for "
-        f"each by itself, or {AUTO}"
+        f"hydra.sweeper.population={asked}: must be the largest number of runs that train together (1: each "
+        f"alone), or {AUTO}"
     )

@@ -22,13 +22,13 @@ from gridworld.errors import InputError, reason
 from gridworld.process.console import ProgressLine, tell, tell_error, time_left
 from gridworld.process.processes import LostError
 from gridworld.process.signals import exiting, signal_name
-from gridworld.run.folder import ERROR_FILE
+from gridworld.run.folder import ERROR_FILE, shell_path
 from gridworld.storage.atomic_write import inside, write_text
 from gridworld.sweep import console
 from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, JobRow, SweepFolder
 from gridworld.sweep.job import StopSweep, Worker, mark_failed, run_status
 from gridworld.sweep.launchers import Group, Launch, launcher_settings, run_groups
-from gridworld.sweep.plan import Configurations, Job, expand, plan, populations, runs_in_turn
+from gridworld.sweep.plan import Configurations, Job, expand, largest_population, plan, populations
 
 _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
 _POLL_SECONDS = 0.1
@@ -43,11 +43,12 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
     folder = SweepFolder(Path(master.hydra.sweep.dir))
     launcher, own = launcher_settings(master)
     callbacks = context.callbacks if len(master.hydra.callbacks) > _OURS else None
-    in_turn = callbacks is not None or runs_in_turn(settings, master.hydra)
-    if (launcher == "forks" and in_turn) or (launcher == "joblib" and settings.stop_at_first_failure):
+    first_counts = settings.stop_at_first_failure
+    in_turn = first_counts or master.hydra.job.chdir  # jobs cannot train together
+    if (launcher == "forks" and (callbacks or in_turn)) or (launcher == "joblib" and first_counts):
         launcher = "basic"
-    divide = partial(populations, settings=settings, launcher=launcher, own=own, hydra=master.hydra)
-    divide([])  # finds a mistake
+    most = 1 if in_turn else largest_population(settings.population)
+    divide = partial(populations, most=most, launcher=launcher, own=own)
     words = [*_of_yaml(settings), *words]  # a word of the command line comes later, and counts
     loader = context.config_loader
     jobs = plan(expand(words, loader, settings.max_jobs, settings.paired), Configurations(loader, master))
@@ -70,8 +71,8 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
         raise  # from a cluster, not from a disk
     except OSError as error:
         again = console.resume_command(folder.path)
-        where = console.shell_path(folder.path)
-        tell_error(f"{where}: {reason(error)}; put that right, then resume with: {again}")
+        where = shell_path(folder.path)
+        tell_error(f"{where}: {reason(error)}; fix that, then resume with: {again}")
         code = 1
     if code:
         raise SystemExit(code)
@@ -148,7 +149,7 @@ class _Sweep:
         for job in jobs:
             if job.hash in lost and self._row(job).status in (PENDING, INTERRUPTED):
                 folder = self._folder.path / self._names[job.hash]
-                mark_failed(folder, f"its process was lost ({lost[job.hash]})")
+                mark_failed(folder, f"its process died ({lost[job.hash]})")
 
     def _launch(self, groups: Sequence[Sequence[Job]]) -> dict[str, str]:
         """Run populations; returns why a process was lost, by the hashes of its jobs."""

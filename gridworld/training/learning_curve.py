@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import Agent, PolicySnapshot
+from gridworld.agents import Agent, PolicySnapshot, WriteScalars
 from gridworld.config.train import TrainConfig
 from gridworld.envs.statistics_env import NO_EPISODES, Returns, StatisticsVectorEnv
 from gridworld.errors import InputError
@@ -27,11 +27,10 @@ from gridworld.storage.atomic_write import AppendLog
 from gridworld.storage.safe_read import csv_text
 from gridworld.storage.serialization import State
 from gridworld.world.evaluation import Evaluator, Score
-from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score
+from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score, regret_text
 
 if TYPE_CHECKING:
     from gridworld.process.console import Progress
-    from gridworld.training.tensorboard import EventWriter
 
 # TensorBoard sorts its groups by name and opens with the first: the greedy policy's learning curve. Behind it
 # are the greedy policy's other metrics, the sampled policy, and the optimum, which is a flat line.
@@ -263,7 +262,7 @@ def read_curve(log: AppendLog) -> dict[str, NDArray[np.float64]]:
 def show_progress(progress: Progress, evaluation: Evaluation) -> None:
     """Show how good the greedy policy is, next to the progress."""
     greedy = evaluation.greedy
-    note = f"regret {greedy.regret:.3g}, goal {greedy.outcome.goal:.0%}"
+    note = f"regret {regret_text(greedy.regret)}, goal {greedy.outcome.goal:.0%}"
     progress.update(evaluation.step, note + (", certified optimal" if greedy.certified else ""))
 
 
@@ -288,8 +287,8 @@ CHARTS = _charts()  # of TensorBoard's Custom Scalars tab, {title: tags}
 class CurveScalars:
     """TensorBoard's scalars: a point per evaluation and metric, and the optimum with it."""
 
-    def __init__(self, events: EventWriter, evaluator: Evaluator) -> None:
-        self._events = events
+    def __init__(self, write_scalars: WriteScalars, evaluator: Evaluator) -> None:
+        self._write_scalars = write_scalars
         best = optimal_score(evaluator)
         self._optimum = {
             f"{OPTIMUM}/{metric.name}": float(metric.of(best)) for metric in METRICS if metric.has_optimum
@@ -304,4 +303,4 @@ class CurveScalars:
         for metric in TRAINING_METRICS:
             if (number := metric.of(evaluation.returns)) is not None:
                 tags[metric.tag] = number
-        self._events.scalars(tags, evaluation.step)
+        self._write_scalars(tags, evaluation.step)

@@ -9,13 +9,11 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import PolicySnapshot
 from gridworld.config.train import PICTURES, Picture, TrainConfig
 from gridworld.envs.rendering import fitting_cell_size
 from gridworld.errors import InputError
@@ -24,27 +22,15 @@ from gridworld.training.learning_curve import Evaluation
 from gridworld.training.tensorboard import EventWriter
 from gridworld.visualization.animation import Animation
 from gridworld.visualization.files import encode_gif, encode_png, save
-from gridworld.visualization.picture import Draw, PolicyHistory, drawer
+from gridworld.visualization.picture import Draw, PolicyHistory, Subject, drawer
 from gridworld.world.evaluation import Evaluator
 
 # Pixels that pictures have in TensorBoard. It scales by skipping pixels: thin lines vanish, text frays.
 _IMAGES_TAB, _TIME_SERIES_CARD = 350, 240
-_GROUP = "pictures"  # of TensorBoard's tags: behind the learning curve
+# TensorBoard's groups, behind the learning curve. It sorts "/" and "_" alike: policy comes before rest.
+_FIRST, _OTHERS = "pictures", "pictures_rest"
 
 _log = logging.getLogger("gridworld")
-
-
-@dataclass(frozen=True, eq=False)
-class _Subject:
-    """See `visualization.picture.Subject`."""
-
-    config: TrainConfig
-    is_trusted: bool
-    evaluator: Evaluator
-    snapshot: PolicySnapshot
-    steps: int
-    visits: NDArray[np.int64]
-    history: PolicyHistory | None
 
 
 class Pictures:
@@ -116,9 +102,9 @@ class Pictures:
                 with self._left_out_if_too_large(f"TensorBoard's {picture.name}"):
                     self._show(picture, drawer(picture.drawer)(subject), evaluation.step)
 
-    def _subject(self, evaluation: Evaluation, visits: NDArray[np.int64]) -> _Subject:
+    def _subject(self, evaluation: Evaluation, visits: NDArray[np.int64]) -> Subject:
         of_run = self._config, self._is_trusted, self._evaluator
-        return _Subject(*of_run, evaluation.snapshot, evaluation.step, visits, self._history)
+        return Subject(*of_run, evaluation.snapshot, evaluation.step, visits, self._history)
 
     @contextlib.contextmanager
     def _left_out_if_too_large(self, label: str) -> Iterator[None]:
@@ -135,7 +121,7 @@ class Pictures:
             return
         side = _IMAGES_TAB if picture.is_map else _TIME_SERIES_CARD
         drawn = draw(fitting_cell_size(self._evaluator.mdp, side))
-        tag = f"{_GROUP}/{picture.name}"
+        tag = f"{_FIRST if picture.while_training else _OTHERS}/{picture.name}"
         if isinstance(drawn, Animation):
             encoded, size = encode_gif(drawn, self._config.recording.fps), drawn.size
         else:

@@ -13,16 +13,15 @@ import logging
 import math
 import shlex
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gridworld.agents import Agent, Learning, family
+from gridworld.agents import Agent, Learning
 from gridworld.config.settings import privileges
 from gridworld.config.train import AUTO, TrainConfig
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.console import Progress, tell
 from gridworld.process.signals import StopRequest
@@ -96,10 +95,15 @@ class Session:
         self._events: EventWriter | None = None
         if config.logging.tensorboard:
             self._events = EventWriter(folder, None if state is None else state["marks"]["events"])
-        observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
-        write_scalars = None if self._events is None else self._events.scalars
-        context = make_context(config, mdp, observation, write_scalars)
-        self._agent = family(config.agent).build(config.agent, context)
+        self._origin = {"identity": identity(config, mdp.text()), "environment": environment(config.agent)}
+        self._wandb: Any = None
+        if config.logging.wandb:
+            from gridworld.training.wandb_log import begin
+
+            self._wandb = begin(config, [self._origin["identity"], folder.absolute()], state is not None)
+        self._has_scalars = config.logging.tensorboard or config.logging.wandb
+        context = make_context(config, mdp, self._write_scalars if self._has_scalars else None)
+        self._agent: Agent = config.agent.build(context)
         on_built(self._agent)
         self._visits = context.envs.visits
         self._curve = LearningCurve(self._evaluator, self._agent, config, context.envs)
@@ -112,7 +116,6 @@ class Session:
                 self._pictures.set_state(state["pictures"])
                 self.reached, seconds = int(state["steps"]), float(state["seconds"])
             self.checkpoints.newest = self.reached
-        self._origin = {"identity": identity(config, mdp.text()), "environment": environment(config.agent)}
         self._pace = Pace(self._checkpoint_every(), self.reached)
         self._stop = StopRequest()
         self._started = clock() - seconds
@@ -120,9 +123,15 @@ class Session:
     def _checkpoint_every(self) -> int | str | None:
         every = self._config.checkpoint.every
         if every is not None and (unknown := self._agent.class_without_state()) is not None:
-            tell(f"checkpoints: none, since {unknown} does not define get_state and set_state")
+            tell(f"no checkpoints, since {unknown} does not define get_state and set_state")
             return None
         return every
+
+    def _write_scalars(self, values: Mapping[str, float], step: int) -> None:
+        if self._events is not None:
+            self._events.scalars(values, step)
+        if self._wandb is not None:
+            self._wandb.log({**values, "step": step})
 
     def progress(self) -> dict[str, int | None]:
         """How many steps were made, and how many of them are saved."""
@@ -153,14 +162,14 @@ class Session:
 
     def _open(self, run: RunWriter) -> None:
         """Open the curve's file, cut back to the state, and the rest that takes evaluations."""
-        config, events, state = self._config, self._events, self._continued_from
+        config, state = self._config, self._continued_from
         self._run = run
         self._curve_log = AppendLog(run.curve_file, None if state is None else state["marks"]["curve"])
         label = f"{config.agent.name} on {self._evaluator.mdp.name}"
         self._progress = Progress(config.total_timesteps, label, config.logging.progress)
         self._curve.sinks.append(partial(write_row, self._curve_log))
-        if events is not None:
-            self._curve.sinks.append(CurveScalars(events, self._evaluator).write)
+        if self._has_scalars:
+            self._curve.sinks.append(CurveScalars(self._write_scalars, self._evaluator).write)
         self._curve.sinks += [partial(show_progress, self._progress), self._pictures.write]
 
     def _begin(self) -> None:
@@ -258,6 +267,8 @@ class Session:
         if self._events is not None:
             events = self._events
             closing += [partial(events.end_session, succeeded), lambda: events.log.sync(), events.close]
+        if self._wandb is not None:
+            closing.append(partial(self._wandb.finish, int(not succeeded)))
         ignored = () if succeeded else (OSError, InputError)
         with contextlib.suppress(*ignored), contextlib.ExitStack() as stack:
             for close in reversed(closing):  # all of them, whatever one raises

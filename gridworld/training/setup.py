@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
+from importlib.util import find_spec
 
-from gridworld.agents import TrainingContext, WriteScalars, family
+from gridworld.agents import TrainingContext, WriteScalars
 from gridworld.config.presets import LARGE, STOCHASTIC, fitting_preset, is_recipe_for
 from gridworld.config.train import AUTO, PICTURES, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
-from gridworld.envs.observations import ObservationTable
+from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.errors import InputError
+from gridworld.errors import InputError, install_command
 from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
 
@@ -22,27 +23,24 @@ _QUICKLY_SOLVED = 6000  # outcomes of all states and actions
 def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled) -> Mdp:
     """Check everything that can be checked without the agent's library; returns the run's world."""
     check(config)
-    family(config.agent).check(config)
+    config.agent.check(config)
     mdp = world(config.env)
     config.env.step_limit(mdp)
+    if config.logging.wandb and find_spec("wandb") is None:
+        raise InputError(f"logging.wandb=true: wandb is not installed; {install_command('wandb')}")
     wanted = config.recording
     if wanted.mp4:
         from gridworld.visualization.files import require_video
 
         require_video()
-    if wanted.cell_size is not None and (wanted.frames or wanted.gif or wanted.mp4):
+    if wanted.cell_size is not None and (wanted.learning or wanted.frames or wanted.gif or wanted.mp4):
         from gridworld.envs.rendering import frame_size
 
         frame_size(mdp, wanted.cell_size)
     return mdp
 
 
-def make_context(
-    config: TrainConfig,
-    mdp: Mdp,
-    observation: ObservationTable,
-    write_scalars: WriteScalars | None = None,
-) -> TrainingContext:
+def make_context(config: TrainConfig, mdp: Mdp, write_scalars: WriteScalars | None = None) -> TrainingContext:
     """Make `config.n_envs` fresh environments, and what else an agent is built from."""
     share = config.exploring_starts
     return TrainingContext(
@@ -53,7 +51,7 @@ def make_context(
             mdp=_with_exploring_starts(mdp, share) if share else mdp,
             stratified=config.stratified_draws,
         ),
-        observation=observation,
+        observation=make_observation(mdp, config.observation.kind, config.observation.cell_size),
         seed=config.seed,
         device=config.device,
         threads=config.threads,
@@ -72,7 +70,7 @@ def import_for(config: TrainConfig) -> None:
     """Import what a run of this configuration takes, for processes that are forked from this one."""
     from gridworld.visualization.picture import drawer
 
-    family(config.agent).import_for(config.agent)
+    config.agent.import_libraries()
     for picture in PICTURES:
         if getattr(config.recording, picture.setting):
             drawer(picture.drawer)
@@ -99,11 +97,13 @@ def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
         elsewhere = "" if is_its else ", tuned in another world"
         found.append(f"recipe {config.recipe}{elsewhere}: {steps}; tuned=none {otherwise}")
     elif config.preset == AUTO and (fitting := fitting_preset(config, lambda: mdp)) is not None:
-        found.append(f"{why}: preset={fitting} is made for that; auto leaves it out with the given settings")
+        found.append(
+            f"{why}: preset={fitting} is meant for that, but is left out because of the given settings"
+        )
     if config.preset in (STOCHASTIC, LARGE):
         found.append(f"{why}: preset={config.preset}, {steps}; preset=none {otherwise}")
     if config.known_failure is not None:
-        found.append(f"agent={config.agent.name} is known to fall short: {config.known_failure}")
+        found.append(f"agent={config.agent.name} is known to fail: {config.known_failure}")
     return [*found, *filter(None, [objective_note(config, mdp)])]
 
 
@@ -124,6 +124,6 @@ def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:
         return None
     key, right = config.agent.key("gamma"), fitting_discounts(judge)[0]
     return (
-        f"{key.lstrip('+')}={gamma:g}: what is optimal under it has a regret of {score.regret:.2g} under "
+        f"{key.lstrip('+')}={gamma:g}: its optimum has a regret of {score.regret:.2g} under "
         f"evaluation.gamma={judged:g}, too much for a certificate; take {key}={right:g}"
     )

@@ -58,10 +58,13 @@ def as_markdown(content: Mapping[str, Any]) -> str:
 
 
 class EventWriter:
-    """Writes one event file, new or continued from its `mark`, which is opened when it is first needed."""
+    """Writes one event file, new or continued from its `mark`, which is opened when it is first needed.
 
-    def __init__(self, folder: Path, mark: dict[str, Any] | None = None) -> None:
-        self._folder, self._mark = folder, mark
+    One that `is_first` seems to be older than others, so that TensorBoard lists it before them.
+    """
+
+    def __init__(self, folder: Path, mark: dict[str, Any] | None = None, is_first: bool = False) -> None:
+        self._folder, self._mark, self._is_first = folder, mark, is_first
 
     @functools.cached_property
     def log(self) -> AppendLog:
@@ -71,7 +74,7 @@ class EventWriter:
         now = time.time()
         name = f"events.out.tfevents.{int(now)}.{os.uname().nodename}.{os.getpid()}"
         log = AppendLog(self._folder / name)
-        log.append(_framed(Event(wall_time=now, file_version=_VERSION)))
+        log.append(_framed(Event(wall_time=1.0 if self._is_first else now, file_version=_VERSION)))
         return log
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:

@@ -35,15 +35,10 @@ def alone(training: Callable[P, Training[T]]) -> Callable[P, T]:
 
 
 def run_together(trainings: Sequence[Training[T]]) -> list[T | Exception]:
-    """Run trainings, which begin in this order, until all have ended.
+    """Run trainings, which begin in this order; returns what each returned, or its `Exception`.
 
-    Returns:
-        What each returned, or the exception that it raised.
-
-    Raises:
-        SystemExit: a training raised it. The others ran to their ends; those that had not begun were left
-            out.
-        BaseException: one of another kind that is not an `Exception`. It was raised in the others too.
+    Where one raises `SystemExit`, those that have begun end first, the others are left out, and it is raised.
+    Any other exception, such as a signal's, is raised in the others too.
     """
     runs = [_Run(training, len(trainings)) for training in trainings]
     try:
@@ -79,11 +74,7 @@ class _Run(Generic[T]):
         self._context.run(share_clock, runs)
 
     def resume(self) -> None:
-        """Let it come to where it learns, or to its end.
-
-        Raises:
-            BaseException: what it raises that is neither an `Exception` nor a `SystemExit`.
-        """
+        """Let it come to where it learns, or to its end; raises only what stops all of them."""
         error, self.error = self.error, None
         try:
             if error is None:

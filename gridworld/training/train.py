@@ -36,19 +36,11 @@ def training(
     world: Callable[[EnvConfig], Mdp] = compiled,
     on_built: OnBuilt = ignore,
 ) -> Training[Summary]:
-    """Train, evaluate and record as configured.
+    """Train, evaluate and record as configured; the manifest says that the command line changed `overrides`.
 
-    Args:
-        config: the run's settings.
-        folder: the run's, which everything is written to.
-        overrides: what the command line changed, for the manifest.
-        world: makes the configured world, or returns one that there is.
-        on_built: takes the agent before it learns.
-
-    Raises:
-        InputError: for a mistake in the settings, before anything is written, or where training diverges.
-        MachineError: where files cannot be written.
-        Interrupted: by a signal, after a checkpoint.
+    `world` makes the configured world, or returns an existing one; `on_built` takes the agent before it
+    learns. A mistake in the settings is an `InputError` before anything is written; so is a divergence.
+    Raises `MachineError` where files cannot be written, and `Interrupted` after a signal and a checkpoint.
     """
     with TrainLog() as log:
         mdp = check_settings(config, world)
@@ -57,7 +49,7 @@ def training(
         manifest = folder / MANIFEST
         is_empty = os.path.lexists(manifest) and not is_started(folder)
         if is_empty:
-            tell(f"{manifest}: is empty, and nothing of the run was saved; it begins anew")
+            tell(f"{manifest}: is empty, so nothing of the run was saved; it starts over")
         begin = partial(RunWriter.start, folder, dataclasses.asdict(config), mdp, overrides, replace=is_empty)
         return (yield from carry_out(config, folder, mdp, begin, log, world is compiled, on_built=on_built))
 
@@ -82,7 +74,7 @@ def carry_out(
         run = begin()
         log.open(run.log_file)
         if state is None:
-            log.add(f"begins: {shlex.join(recorded_command_line())}")
+            log.add(f"starts: {shlex.join(recorded_command_line())}")
         summary = yield from session.run(run)
     except BaseException as error:
         if run is not None and session is not None and not isinstance(error, FolderLostError):
@@ -91,7 +83,9 @@ def carry_out(
         if isinstance(error, StateError):
             raise InputError(f"{folder}: its checkpoint does not fit this run: {error}") from None
         if isinstance(error, OSError):
-            raise _unwritable(folder, config, error) from None
+            resume = RunFolder(folder).resume_command(dataclasses.asdict(config))
+            how = f"resume with {resume}" if (folder / MANIFEST).exists() else "run the command again"
+            raise MachineError(f"{shown(folder)}: {reason(error)}; fix that, then {how}") from None
         raise
     session.checkpoints.keep(1)
     run.end("finished", None, **session.progress())
@@ -112,10 +106,3 @@ def _note_end(run: RunWriter, log: TrainLog, error: BaseException, progress: dic
     if failed and not isinstance(error, InputError | StateError):
         write_text(run.error_file, traceback.format_exc())
     run.end(status, reason(error), **progress)
-
-
-def _unwritable(folder: Path, config: TrainConfig, error: OSError) -> MachineError:
-    run = RunFolder(folder)
-    resume = run.resume_command(dataclasses.asdict(config))
-    how = f"go on with {resume}" if run.manifest_file.exists() else "give the command again"
-    return MachineError(f"{shown(folder)}: {reason(error)}; put that right, then {how}")

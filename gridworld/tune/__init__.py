@@ -4,5 +4,4 @@ study_spec.py                    a command line -> the configuration to begin fr
 study.py                         a study from its beginning to its verdict, and its folder
 search.py, objective.py          the study in its database; trials, and what their settings come to
 confirmation.py                  the best few on more seeds; the winner on seeds that nothing was chosen by
-workers.py                       the processes that train all this
 """

@@ -24,6 +24,7 @@ from optuna.trial import FrozenTrial, TrialState
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console import tell
+from gridworld.process.processes import LostError, Processes
 from gridworld.report import statistics
 from gridworld.report.tables import number, steps_up_to
 from gridworld.run.provenance import settings_hash
@@ -34,12 +35,12 @@ from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.training.together import Training, run_together
 from gridworld.tune.objective import FINAL, SEEDS, Outcome, SeedScore, Trials, read_score, score
 from gridworld.tune.study_spec import StudySpec
-from gridworld.tune.workers import Ask, Workers
 from gridworld.world.mdp import FloatArray
 
 CONFIRM = "confirm"  # the folder of the winner's runs, in the study's
 _HASH_SHOWN = 8  # characters
 _LOST_REGRET = sys.float_info.max  # of a run that failed
+_IN_TENSORBOARD = 10  # runs of a configuration: of more than 40 runs it selects none
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def choose_finalists(study: Study, spec: StudySpec) -> list[FrozenTrial]:
 
 
 def rank_finalists(
-    spec: StudySpec, study: Study, trials: Sequence[FrozenTrial], workers: Workers
+    spec: StudySpec, study: Study, trials: Sequence[FrozenTrial], workers: Processes
 ) -> list[Finalist]:
     """Run what the finalists lack on the final seeds; returns them, the winner first."""
     runs = {
@@ -80,20 +81,19 @@ def rank_finalists(
         if _name(trial, seed) not in study.user_attrs
     }
     if runs:
-        tell(f"the {len(trials)} finalists on {len(spec.final_seeds)} seeds more: {len(runs)} runs")
+        tell(f"the {len(trials)} finalists on {len(spec.final_seeds)} more seeds: {len(runs)} runs")
     shares = workers.shares(list(runs), spec.base.agent.shape is not None)
     tasks = (Trials(spec.objective, {name: runs[name] for name in names}) for names in shares)
 
-    def on_end(task: Trials, outcomes: Sequence[Outcome] | None) -> None:
-        lost = Outcome(error="the workers that ran it were killed")
-        ended = outcomes or [lost] * len(task.trials)
-        for (name, (_, (seed,))), outcome in zip(task.trials.items(), ended, strict=True):
+    def on_end(task: Trials, outcomes: list[Outcome] | LostError) -> None:
+        for name, outcome in task.ended(outcomes):
+            _, (seed,) = runs[name]
             if outcome.error:
                 tell(f"{name.removeprefix(FINAL)} failed, and counts as not certified: {outcome.error}")
             found = SeedScore(seed, None, _LOST_REGRET) if outcome.error else outcome.seeds[0]
             study.set_user_attr(name, dataclasses.asdict(found))
 
-    workers.run_all(tasks, on_end)
+    workers.run(tasks, on_end)
     attributes = study.user_attrs
     ranked = []
     for trial in trials:
@@ -118,19 +118,14 @@ class HeldOutRun:
     config: TrainConfig
 
 
-@dataclass(frozen=True)
-class HeldOutRuns:
-    """A worker's task: such runs, together where they can. What came of them is in their folders."""
-
-    runs: tuple[HeldOutRun, ...]
-
-    def __call__(self, ask: Ask) -> None:
-        for result in run_together([_run(run) for run in self.runs]):
-            if isinstance(result, Exception):
-                raise result
+def run_held_out(runs: Sequence[HeldOutRun]) -> None:
+    """Train such runs, together where they can; what came of them is in their folders."""
+    for result in run_together([_training(run) for run in runs]):
+        if isinstance(result, Exception):
+            raise result
 
 
-def _run(run: HeldOutRun) -> Training[None]:
+def _training(run: HeldOutRun) -> Training[None]:
     inside(run.folder.parents[1], CONFIRM, run.folder.name).mkdir(parents=True, exist_ok=True)
     try:
         yield from run_in_sweep(run.config, run.folder, [], stop_at_failure=False)
@@ -139,13 +134,15 @@ def _run(run: HeldOutRun) -> Training[None]:
 
 
 def held_out_runs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[int]) -> list[HeldOutRun]:
-    """A run of a configuration on each seed.
+    """A run of a configuration on each seed; only the first ones write event files.
 
     A run's folder has a hash of its settings in its name: other settings are other runs.
     """
-    world, runs = config.env.compile().text(), []
+    world, runs = config.env.compile().text(), list[HeldOutRun]()
+    silent = dataclasses.replace(config.logging, tensorboard=False)
     for seed in seeds:
-        of_seed = dataclasses.replace(config, seed=seed)
+        logging = config.logging if len(runs) < _IN_TENSORBOARD else silent
+        of_seed = dataclasses.replace(config, seed=seed, logging=logging)
         digest = settings_hash(dataclasses.asdict(of_seed), world)[:_HASH_SHOWN]
         runs.append(HeldOutRun(folder / CONFIRM / f"{name},{digest},seed={seed}", of_seed))
     return runs
@@ -163,7 +160,7 @@ def prepare(folder: Path, runs: Sequence[HeldOutRun]) -> None:
             remove_path(path)
     for run in runs:
         if damaged := _damage(run.folder):
-            tell(f"{damaged}; it is run again")
+            tell(f"{damaged}; it runs again")
             remove_path(run.folder)
 
 
@@ -184,7 +181,7 @@ def certified_since(folder: Path) -> float | None:
     if row.status == FAILED:
         return None
     if run is None or not run.is_finished:
-        raise InputError("it did not come to its end" + (f" ({row.error})" if row.error else ""))
+        raise InputError("it did not finish" + (f" ({row.error})" if row.error else ""))
     since = run.read_summary().get("certified_since_step")
     if since is not None and (type(since) is not int or since < 0):
         raise InputError(f"{run.summary_file}: certified_since_step must be a number of steps, or null")
@@ -210,9 +207,9 @@ class HeldOutResults:
         median, form = statistics.interval(statistics.median, [self.steps], 0), steps_up_to(self.total)
         share = self.certified
         text = (
-            f"certified on {share.count} of {share.total} "
-            f"[{100 * share.low:.0f} %, {100 * share.high:.0f} %], for good by step {form(median.point)} "
-            f"[{form(median.low)}, {form(median.high)}] in the median"
+            f"certified on {share.count} of {share.total} [{100 * share.low:.0f} %, {100 * share.high:.0f} "
+            f"%], for good from step {form(median.point)} [{form(median.low)}, {form(median.high)}] in the "
+            "median"
         )
         notes = []
         if self.failed:
@@ -237,7 +234,7 @@ def read_results(runs: Sequence[HeldOutRun]) -> HeldOutResults:
         try:
             found = certified_since(run.folder)
         except InputError as error:
-            tell(f"{run.folder}: is left out; {error}")
+            tell(f"{run.folder}: is left out: {error}")
             left_out.append(run.folder.name)
             continue
         steps.append(math.inf if found is None else found)
@@ -263,9 +260,9 @@ def verdict_on(winner: HeldOutResults, began_from: HeldOutResults) -> dict[str, 
     verdict = ("does not beat", "cannot be distinguished from", "beats")[1 + side]
     asked = len(winner.steps) + len(winner.left_out)
     sentence = (
-        f"On {asked} held-out seeds the winner {verdict} the settings that the search began from: "
-        f"{winner.text()}, against {began_from.text()}; a run of it is certified sooner with probability "
-        f"{number(sooner.point)} [{number(sooner.low)}, {number(sooner.high)}]."
+        f"On {asked} held-out seeds the winner {verdict} the baseline: {winner.text()}, against "
+        f"{began_from.text()}; its runs are certified sooner with probability {number(sooner.point)} "
+        f"[{number(sooner.low)}, {number(sooner.high)}]."
     )
     return {
         "verdict": verdict,

@@ -21,7 +21,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -29,17 +29,16 @@ from typing import Any
 from omegaconf import OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.agents import Learning, family
+from gridworld.agents import Learning
 from gridworld.bounds import LARGEST_INTEGER
 from gridworld.config.compose import to_config
 from gridworld.config.train import TrainConfig
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError, reason
+from gridworld.process.processes import LostError
 from gridworld.process.signals import handling
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.setup import check_settings, make_context
 from gridworld.training.together import Training, run_together
-from gridworld.tune.workers import Ask
 from gridworld.world.evaluation import Evaluator
 
 SEEDS, ERROR, WORKER, DRAW = "seeds", "error", "worker", "draw"  # attributes of a trial in the study
@@ -120,6 +119,9 @@ class Report:
     can_prune: bool
 
 
+Ask = Callable[[Report], bool]
+
+
 @dataclass
 class Outcome:
     """How a trial ended: its score, or that it was pruned, or why it failed."""
@@ -131,18 +133,24 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Trials:
-    """A worker's task: trials, which train together where they can. Returns their outcomes."""
+    """A task: trials, which train together where they can. Returns their outcomes."""
 
     objective: Objective
     trials: Mapping[Any, tuple[Values, tuple[int, ...]]]  # values and seeds, by the trial's number or name
 
-    def __call__(self, ask: Ask) -> list[Outcome]:
+    def __call__(self, ask: Ask = lambda report: False) -> list[Outcome]:
         trials = [_Trial(self.objective, name, *trial, ask) for name, trial in self.trials.items()]
         runs = [trial.training(place) for trial in trials for place in range(len(trial.seeds))]
         at_once = dict.fromkeys((signal.SIGINT, signal.SIGTERM), signal.SIG_DFL)
         with handling(at_once):  # there is nothing to save
             run_together(runs)
         return [trial.outcome or Outcome() for trial in trials]
+
+    def ended(self, outcomes: list[Outcome] | LostError) -> Iterator[tuple[Any, Outcome]]:
+        """How each trial ended, by its number or name."""
+        lost = Outcome(error="its workers were killed")
+        of_each = [lost] * len(self.trials) if isinstance(outcomes, LostError) else outcomes
+        return zip(self.trials, of_each, strict=True)
 
 
 class _EndedError(Exception):
@@ -225,10 +233,9 @@ def learning(
     """Train and evaluate as a run would, and keep nothing but the end."""
     config = dataclasses.replace(config, seed=seed)
     mdp = check_settings(config)
-    observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
     evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
-    context = make_context(config, mdp, observation)
-    agent = family(config.agent).build(config.agent, context)
+    context = make_context(config, mdp)
+    agent = config.agent.build(context)
     curve = LearningCurve(evaluator, agent, config, envs=context.envs)
     steps = 0
 

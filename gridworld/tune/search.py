@@ -18,7 +18,7 @@ import time
 import uuid
 import warnings
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -31,10 +31,11 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from gridworld.errors import InputError
 from gridworld.process.console import ProgressLine, tell, time_left
+from gridworld.process.processes import LostError, Processes
 from gridworld.report.tuning_study import TRIALS_CSV
+from gridworld.run.folder import shell_path
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.safe_read import csv_text
-from gridworld.sweep.console import shell_path
 from gridworld.sweep.folder import one_line
 from gridworld.tune.objective import (
     DRAW,
@@ -49,7 +50,6 @@ from gridworld.tune.objective import (
     read_score,
 )
 from gridworld.tune.study_spec import SearchSpace, StudySpec
-from gridworld.tune.workers import SearchError, Workers
 
 # Attributes of the study.
 ABOUT = "gridworld"  # what makes its trials comparable
@@ -63,6 +63,10 @@ _DAMAGE = (
     *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, AssertionError),
     *(SQLAlchemyError, OptunaError),
 )
+
+
+class SearchError(Exception):
+    """A search that had begun came to nothing, or cannot be continued; in one sentence."""
 
 
 def study_url(spec: StudySpec) -> str:
@@ -101,7 +105,7 @@ def open_study(
         storage = None if is_gone else _connect(url)
         if storage is None or (must_exist and name not in optuna.get_all_study_names(storage)):
             raise InputError(
-                f"{_shown(url)}: does not have the study {name}, which has begun; bring its database back, "
+                f"{_shown(url)}: does not have the study {name}, which has started; restore its database, "
                 "or choose another tune.folder"
             )
         study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
@@ -113,8 +117,8 @@ def open_study(
         raise
     except _DAMAGE as error:
         raise InputError(
-            f"{_shown(url)}: cannot be read as a study, it was changed or damaged "
-            f"({type(error).__name__}: {_first_line(error)[:200]}); put back a good copy"
+            f"{_shown(url)}: cannot be read as a study: it was changed or damaged ({type(error).__name__}: "
+            f"{_first_line(error)[:200]}); restore a good copy"
         ) from None
     return study
 
@@ -127,7 +131,7 @@ def _check_same(name: str, before: Mapping[str, Any], about: Mapping[str, Any]) 
             if was.get(key) != now.get(key):
                 told = [json.dumps(each.get(key)) for each in (was, now)]
                 raise InputError(
-                    f"tune.study={name}: was begun with another {part}: {key} was {told[0]}, now it is "
+                    f"tune.study={name}: was started with another {part}: {key} was {told[0]}, now it is "
                     f"{told[1]}; choose another tune.study, or set it back"
                 )
 
@@ -142,7 +146,7 @@ def _check_readable(study: optuna.Study, space: SearchSpace) -> None:
         int(trial.user_attrs.get(DRAW, 0))
         seeds = [read_score(seed) for seed in trial.user_attrs.get(SEEDS, [])]
         if trial.state != TrialState.FAIL and trial.distributions != space.distributions:
-            raise ValueError(f"trial {trial.number} is of another search space")
+            raise ValueError(f"trial {trial.number} belongs to another search space")
         if trial.state == TrialState.COMPLETE and not (seeds and math.isfinite(trial.value or 0.0)):
             raise ValueError(f"trial {trial.number} has no score")
     for key, value in study.user_attrs.items():
@@ -157,8 +161,8 @@ def in_reach(url: str) -> Iterator[None]:
         yield
     except (SQLAlchemyError, OptunaError) as error:
         raise SearchError(
-            f"{_shown(url)}: the study cannot be reached any more ({_first_line(error)}); bring the database "
-            "back, with what has ended in it, and run the command again"
+            f"{_shown(url)}: the study can no longer be reached ({_first_line(error)}); restore the "
+            "database, then run the command again"
         ) from None
 
 
@@ -167,7 +171,7 @@ def _first_line(error: BaseException) -> str:
     return lines[0] if lines else type(error).__name__
 
 
-def search(spec: StudySpec, study: optuna.Study, workers: Workers) -> None:
+def search(spec: StudySpec, study: optuna.Study, workers: Processes) -> None:
     """Run trials until there are enough or it is time to end; keeps trials.csv up to date."""
     run, line = Search(spec, study), ProgressLine(spec.base.logging.progress)
     asked, before = spec.settings.trials, len(study.get_trials(deepcopy=False))
@@ -192,7 +196,7 @@ def search(spec: StudySpec, study: optuna.Study, workers: Workers) -> None:
 
     try:
         if before < asked:
-            more = f", {before} of them there already" if before else ""
+            more = f", {before} of them already there" if before else ""
             tell(
                 f"study {spec.name} in {shell_path(spec.folder)}: {asked} trials of {spec.settings.seeds} "
                 f"seeds{more}, {workers.count * (spec.settings.together or 1)} at once"
@@ -200,7 +204,7 @@ def search(spec: StudySpec, study: optuna.Study, workers: Workers) -> None:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ExperimentalWarning)  # of multivariate sampling
                 warnings.filterwarnings("ignore", "The reported value is ignored")  # of a trial run again
-                workers.run(run.next, run.end, run.answer, on_tick)
+                workers.run(iter(run.next, None), run.end, on_tick, run.answer)
     finally:
         line.clear()
         write_trials(spec.folder, study, spec.space, durable=True)
@@ -251,10 +255,9 @@ class Search:
         trial.report(report.value, report.step)
         return report.can_prune and trial.should_prune()
 
-    def end(self, trials: Trials, outcomes: Sequence[Outcome] | None) -> None:
-        """Store how trials ended; None where they have killed too many workers."""
-        killed = Outcome(error="the workers that ran it were killed")
-        for number, outcome in zip(trials.trials, outcomes or [killed] * len(trials.trials), strict=True):
+    def end(self, trials: Trials, outcomes: list[Outcome] | LostError) -> None:
+        """Store how trials ended."""
+        for number, outcome in trials.ended(outcomes):
             trial = self.running.pop(number)
             if outcome.seeds:
                 trial.set_user_attr(SEEDS, [dataclasses.asdict(seed) for seed in outcome.seeds])

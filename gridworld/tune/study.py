@@ -14,14 +14,14 @@ that it needs neither Optuna nor the database.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import math
 import os
 import shlex
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,27 +32,24 @@ from optuna.trial import FrozenTrial, TrialState
 from gridworld.config.compose import search_path, to_config
 from gridworld.config.fields import Effect
 from gridworld.config.recipe_file import IN_A_STUDY, TRUST, overrides
-from gridworld.config.settings import ON_RESULT, with_effects
+from gridworld.config.settings import ON_RESULT, flat, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console import command, printable, recorded_command_line, tell
-from gridworld.process.processes import can_fork
+from gridworld.process.processes import Processes, can_fork
 from gridworld.process.signals import Interrupted, exiting
 from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.report.writer import write_over_seeds
-from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, alone_in, check_writable
+from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, check_writable, claimed, shell_path
 from gridworld.run.provenance import versions
 from gridworld.storage.atomic_write import (
     check_no_links,
     inside,
     is_locked,
-    make_folder,
-    tidy,
     write_json,
     write_text,
 )
 from gridworld.storage.safe_read import LARGEST_CSV, file_sha256, read_sealed, sealed
-from gridworld.sweep.console import shell_path
 from gridworld.sweep.plan import may_fork
 from gridworld.training.setup import import_for
 from gridworld.training.tensorboard import hparams
@@ -60,18 +57,17 @@ from gridworld.tune.confirmation import (
     CONFIRM,
     Finalist,
     HeldOutRun,
-    HeldOutRuns,
     choose_finalists,
     held_out_runs,
     prepare,
     rank_finalists,
     read_results,
+    run_held_out,
     verdict_on,
 )
 from gridworld.tune.objective import ERROR, with_values
-from gridworld.tune.search import in_reach, open_study, search, study_url
-from gridworld.tune.study_spec import ConfFolders, StudySpec, compose_in
-from gridworld.tune.workers import SearchError, Workers
+from gridworld.tune.search import SearchError, in_reach, open_study, search, study_url
+from gridworld.tune.study_spec import StudySpec, compose_with
 
 SEARCH_JSON = "search.json"
 _EXPERIMENT, _WINNER = IN_A_STUDY
@@ -81,9 +77,9 @@ _OF_A_RECIPE = ON_RESULT - {Effect.SEED, Effect.MACHINE}
 def tune(spec: StudySpec) -> None:
     """Run what the study lacks, confirm the winner, and write and print what came of it."""
     check_study_folder(spec.folder)
-    is_shared = spec.settings.storage is not None
+    alone = spec.settings.storage is None  # nobody else searches for this study
     try:
-        with at_work_in(spec.folder, is_shared), exiting(signal.SIGINT, signal.SIGTERM):
+        with claimed(spec.folder, SEARCH_JSON, alone), exiting(signal.SIGINT, signal.SIGTERM):
             _tune(spec)
     except SystemExit as stop:
         raise Interrupted(int(str(stop.code)) - 128) from None
@@ -94,7 +90,7 @@ def _tune(spec: StudySpec) -> None:
     is_begun = is_claimed(spec.folder, spec.name)
     study = open_study(url, spec.name, about, spec.space, must_exist=is_begun)
     claim(spec.folder, spec.name, about)
-    workers = Workers(int(spec.settings.workers), can_fork() and may_fork(spec.base))
+    workers = Processes(spec.settings.workers, can_fork() and may_fork(spec.base), attempts=4)
     if workers.forks:
         import_for(spec.base)  # once for all of them
     with in_reach(url):
@@ -102,8 +98,8 @@ def _tune(spec: StudySpec) -> None:
         trials = choose_finalists(study, spec)
         if not trials:
             errors = [error for trial in study.trials if (error := trial.user_attrs.get(ERROR))]
-            why = f"all {len(errors)} failed, the first: {errors[0]}" if errors else "there was no time"
-            raise SearchError(f"{shell_path(spec.folder)}: no trial came to a score; {why}")
+            why = f"all {len(errors)} failed, the first: {errors[0]}" if errors else "time ran out"
+            raise SearchError(f"{shell_path(spec.folder)}: no trial got a score; {why}")
         ranked = rank_finalists(spec, study, trials, workers)
         best = next(trial for trial in trials if trial.number == ranked[0].trial)
         _conclude(spec, study, best, ranked, workers)
@@ -126,7 +122,7 @@ def _about(spec: StudySpec) -> dict[str, Any]:
 
 
 def _conclude(
-    spec: StudySpec, study: optuna.Study, best: FrozenTrial, ranked: list[Finalist], workers: Workers
+    spec: StudySpec, study: optuna.Study, best: FrozenTrial, ranked: list[Finalist], workers: Processes
 ) -> None:
     """Confirm the winner, write the recipe and study.json, and print the outcome."""
     values, before = spec.space.values(best.params), spec.space.parameters_of(spec.base)
@@ -136,8 +132,8 @@ def _conclude(
     winner = held_out_runs(spec.folder, name, _tuned(measured, values), spec.held_out) if is_new else []
     began_from = held_out_runs(spec.folder, "default", measured, spec.held_out)
     confirmed = _confirm(spec, winner, began_from, workers)
-    about = f"the best of {len(study.trials)} trials; study.json has what came of it"
-    recipe = write_recipe(spec.folder, spec.folders, spec.choices, tuned, about)
+    about = f"the best of {len(study.trials)} trials; study.json has the results"
+    recipe = write_recipe(spec.folder, spec.conf, spec.choices, tuned, about)
     outcome = {
         "winner": {"trial": best.number, "score": best.value, "values": values},
         "finalists": [dataclasses.asdict(finalist) for finalist in ranked],
@@ -160,7 +156,7 @@ def _conclude(
 
 def _words_for(recipe: Path, spec: StudySpec) -> str:
     """What train.py needs with the recipe: the user's own folders, and trust in the user's own classes."""
-    words = [search_path(spec.folders.own)] if spec.folders.own else []
+    words = [search_path(spec.conf)] if spec.conf else []
     try:
         overrides(recipe)
     except InputError:
@@ -176,7 +172,7 @@ def _tuned(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
 
 
 def _confirm(
-    spec: StudySpec, winner: list[HeldOutRun], began_from: list[HeldOutRun], workers: Workers
+    spec: StudySpec, winner: list[HeldOutRun], began_from: list[HeldOutRun], workers: Processes
 ) -> dict[str, Any]:
     """Run both and compare them; an empty `winner` is for settings that the search began from."""
     runs = [run for pair in itertools.zip_longest(began_from, winner) for run in pair if run is not None]
@@ -185,15 +181,14 @@ def _confirm(
     prepare(spec.folder, runs)
     while runs:
         shares = workers.shares(runs, spec.base.agent.shape is not None)
-        workers.run_all(HeldOutRuns(tuple(share)) for share in shares)
+        workers.run(partial(run_held_out, share) for share in shares)
         runs = [run for run in runs if is_locked(run.folder / LOCK)]  # another machine is at work on them
     before = read_results(began_from)
     if winner:
         return verdict_on(read_results(winner), before)
     return {
         "verdict": "is",
-        "sentence": f"No trial came out better than the settings that the search began from: on {count} "
-        f"held-out seeds these are {before.text()}.",
+        "sentence": f"No trial beat the baseline: on {count} held-out seeds it is {before.text()}.",
     }
 
 
@@ -205,22 +200,6 @@ def check_study_folder(folder: Path) -> None:
     check_writable(folder, "tune.folder")
     for names in ((), (CONFIRM,), (_EXPERIMENT,)):
         check_no_links(folder, *names)
-
-
-@contextlib.contextmanager
-def at_work_in(folder: Path, is_shared: bool = False) -> Iterator[None]:
-    """Make the folder and hold it, unless others share the study; one that stays empty is removed."""
-    make_folder(folder)
-    try:
-        with contextlib.nullcontext() if is_shared else alone_in(folder):
-            if not is_shared:
-                tidy(folder)
-            yield
-    finally:
-        with contextlib.suppress(OSError):
-            if [path.name for path in folder.iterdir()] == [LOCK]:
-                (folder / LOCK).unlink()
-            folder.rmdir()
 
 
 def is_claimed(folder: Path, name: str) -> bool:
@@ -270,7 +249,7 @@ def _importances(study: optuna.Study) -> dict[str, float]:
 
 
 def write_recipe(
-    folder: Path, folders: ConfFolders, choices: Mapping[str, str], config: TrainConfig, about: str
+    folder: Path, conf: tuple[Path, ...], choices: Mapping[str, str], config: TrainConfig, about: str
 ) -> Path:
     """Write the winner as a recipe, and check that it composes to `config` again.
 
@@ -279,34 +258,24 @@ def write_recipe(
     --config-dir runs/STUDY experiment=winner.
     """
 
-    def composed(words: list[str], more: tuple[Path, ...] = ()) -> dict[str, Any]:
-        own = dataclasses.replace(folders, own=(*folders.own, *more))
-        return _relevant(to_config(compose_in(own, "train", words)))
+    def composed(words: list[str], *more: Path) -> dict[str, Any]:
+        return _relevant(to_config(compose_with((*conf, *more), "train", words)))
 
-    bare = composed([f"{group}={choice}" for group, choice in choices.items()])
-    values = _difference(bare, _relevant(config))
+    bare = dict(flat(composed([f"{group}={choice}" for group, choice in choices.items()])))
+    values = OmegaConf.create()
+    for key, value in flat(_relevant(config)):
+        if key not in bare or value != bare[key]:
+            OmegaConf.update(values, key, value)
     lines = ["# @package _global_", f"# {about}", "defaults:"]
     lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
-    lines += ["  - _self_", "", OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""]
+    lines += ["  - _self_", "", OmegaConf.to_yaml(values) if values else ""]
     path = inside(folder, _EXPERIMENT) / _WINNER
     path.parent.mkdir(exist_ok=True)
     write_text(path, "\n".join(lines), durable=True)
     for words in ([f"experiment={path.stem}"], overrides(path, trust=True)):
-        assert composed(words, (folder,)) == _relevant(config), f"{path} does not say what the winner is"
+        assert composed(words, folder) == _relevant(config), f"{path} does not say what the winner is"
     return path
 
 
 def _relevant(config: TrainConfig) -> dict[str, Any]:
     return with_effects(_OF_A_RECIPE, dataclasses.asdict(config))
-
-
-def _difference(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    found = {}
-    for key, value in after.items():
-        was = before.get(key)
-        if isinstance(value, dict) and isinstance(was, dict):
-            if inner := _difference(was, value):
-                found[key] = inner
-        elif key not in before or value != was:
-            found[key] = value
-    return found

@@ -47,7 +47,7 @@ from gridworld.config.recipe_file import CHOSEN, with_recipe
 from gridworld.config.settings import effect_of
 from gridworld.config.sweep import DimensionConfig, TuneConfig
 from gridworld.config.train import AUTO, TrainConfig, check_bounds
-from gridworld.config.words import sentence
+from gridworld.config.words import conf_folder, sentence
 from gridworld.errors import InputError
 from gridworld.process.console import program
 from gridworld.process.processes import core_count
@@ -64,18 +64,10 @@ _TRIALS_AT_ONCE = 8  # over all workers; the sampler knows nothing of those that
 
 
 @dataclass(frozen=True)
-class ConfFolders:
-    """Where yaml files come from: `conf`, and the user's own folders, which are searched after it."""
-
-    conf: Path
-    own: tuple[Path, ...] = ()
-
-
-@dataclass(frozen=True)
 class StudySpec:
     """What a command line asks for."""
 
-    folders: ConfFolders
+    conf: tuple[Path, ...]  # the user's own folders of yaml files, which are searched after `conf/`
     base: TrainConfig  # the configuration that the search begins from
     choices: dict[str, str]  # of CHOSEN
     settings: TuneConfig  # without null where a default follows from the rest
@@ -112,12 +104,15 @@ class StudySpec:
         return range(self.final_seeds.stop, self.final_seeds.stop + self.settings.confirm_seeds)
 
 
-def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
-    """Compose and check everything that a command line asks for. Raises `InputError`."""
+def compose_study(words: Sequence[str], conf: tuple[Path, ...] = ()) -> StudySpec:
+    """Compose and check everything that a command line asks for; `conf` are folders of the user's own.
+
+    Raises `InputError`.
+    """
     register_schemas()
     try:
         of_search, of_run = _divide(with_recipe(words))
-        whole = compose_in(folders, "train", of_run)
+        whole = compose_with(conf, "train", of_run)
         choices = {group: str(whole.hydra.runtime.choices[group]) for group in CHOSEN}
         if choices["preset"] == AUTO:  # nothing was chosen, and nothing is to be for the winner
             choices["preset"] = "none"
@@ -126,7 +121,7 @@ def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
             choices["tuned"] = "none"
         if not any(override.key_or_group == "tune" for override in of_search):
             of_search = [*of_search, *_parse([f"tune={choices['agent']}"])]
-        search = compose_in(folders, "tune", of_search)
+        search = compose_with(conf, "tune", of_search)
         space_name = str(search.hydra.runtime.choices["tune"])
         settings = cast(TuneConfig, OmegaConf.to_object(search.tune))
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
@@ -134,20 +129,20 @@ def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
     settings = _completed(settings, choices["agent"], base)
     space = SearchSpace(settings.space, space_name)
     space.check(base, check_settings(base))
-    spec = StudySpec(folders, base, choices, settings, space)
+    spec = StudySpec(conf, base, choices, settings, space)
     if spec.held_out.stop > _LARGEST_SEED:
-        raise InputError(f"seed={base.seed}: leaves no room for the other seeds after it, below 2**32")
+        raise InputError(f"seed={base.seed}: leaves no room for the seeds after it, below 2**32")
     return spec
 
 
-def compose_in(folders: ConfFolders, name: str, overrides: Sequence[Override | str]) -> DictConfig:
-    """Compose `name` as Hydra does, with Hydra's own part. Raises Hydra's exceptions."""
+def compose_with(conf: tuple[Path, ...], name: str, overrides: Sequence[Override | str]) -> DictConfig:
+    """Compose `name`, also from these folders, with Hydra's own part. Raises Hydra's exceptions."""
     lines = [str(each.input_line) if isinstance(each, Override) else each for each in overrides]
-    if folders.own:
-        lines.append(search_path(folders.own))
+    if conf:
+        lines.append(search_path(conf))
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # a folder that is not there
-        return compose_whole(folders.conf.absolute(), name, lines)[0]
+        return compose_whole(conf_folder(), name, lines)[0]
 
 
 def _divide(words: Sequence[str]) -> tuple[list[Override], list[Override]]:
@@ -156,12 +151,12 @@ def _divide(words: Sequence[str]) -> tuple[list[Override], list[Override]]:
     for override in _parse(words):
         if override.is_sweep_override():
             raise InputError(
-                f"{override.input_line}: a study searches from one configuration; give one value, and put "
-                "what is to be searched into a file in conf/tune"
+                f"{override.input_line}: a study has one baseline configuration; give one value, and put "
+                "the search space into a file in conf/tune"
             )
         if override.key_or_group.startswith("hydra."):
             raise InputError(
-                f"{override.input_line}: {program('tune')} makes its own folder; see tune.folder"
+                f"{override.input_line}: {program('tune')} makes its own folder; use tune.folder"
             )
         (of_search if override.key_or_group.split(".")[0] == "tune" else of_run).append(override)
     return of_search, of_run
@@ -181,7 +176,9 @@ def _completed(settings: TuneConfig, agent: str, base: TrainConfig) -> TuneConfi
             raise InputError(f"tune.{key}={value}: must be {', '.join(known[:-1])} or {known[-1]}")
     study = settings.study or f"tune_{slug(agent)}_{slug(base.env.name)}"
     if slug(study) != study:
-        raise InputError(f"tune.study={study}: must be of letters, digits and _.,=+-, e.g. {slug(study)}")
+        raise InputError(
+            f"tune.study={study}: must consist of letters, digits and _.,=+-, e.g. {slug(study)}"
+        )
     workers = core_count() if settings.workers == -1 else settings.workers
     together = settings.together or (1 if workers == 1 else math.ceil(_TRIALS_AT_ONCE / workers))
     together = together if base.agent.shape is not None else 1
@@ -199,8 +196,8 @@ class SearchSpace:
     def __post_init__(self) -> None:
         if not self.distributions:
             raise InputError(
-                f"tune={self.name}: there is nothing to search; its file needs the first line "
-                "'# @package tune.space' and a line for each key"
+                f"tune={self.name}: the search space is empty; its file needs '# @package tune.space' as "
+                "first line, then a line per key"
             )
 
     @cached_property
@@ -272,19 +269,19 @@ def _distribution(key: str, dimension: DimensionConfig) -> BaseDistribution:
     kind, choices = dimension.type, dimension.choices
     low, high, step, log = dimension.low, dimension.high, dimension.step, dimension.log
     if (effect := effect_of(key)) in _GIVEN:
-        raise InputError(f"{key}: is part of the task, not of what may be chosen to solve it")
+        raise InputError(f"{key}: is part of the task, so it cannot be searched")
     if effect is not Effect.LEARNING:
-        raise InputError(f"{key}: changes nothing about what is learnt, so there is nothing to search")
+        raise InputError(f"{key}: does not affect what is learnt, so it cannot be searched")
     if kind == "categorical":
         if not choices or len(set(map(json.dumps, choices))) < len(choices):
-            raise InputError(f"{key}: type=categorical takes choices, a list of different values")
+            raise InputError(f"{key}: type=categorical needs choices, a list of different values")
         return CategoricalDistribution([_token(choice) for choice in choices])
     if kind not in ("float", "int"):
         raise InputError(f"{key}: type={kind} must be float, int or categorical")
     if low is None or high is None or not -math.inf < low < high < math.inf:
-        raise InputError(f"{key}: type={kind} takes two numbers, low={low} below high={high}")
+        raise InputError(f"{key}: type={kind} needs two numbers with low < high, not low={low}, high={high}")
     if kind == "int" and not all(float(number).is_integer() for number in (low, high, step or 1.0)):
-        raise InputError(f"{key}: type=int takes whole numbers; it has low={low}, high={high}, step={step}")
+        raise InputError(f"{key}: type=int needs whole numbers, not low={low}, high={high}, step={step}")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # that the step does not lead from low to high

@@ -107,7 +107,7 @@ def animation_of_frames(frames: Iterable[Frame | Packed], likely: Iterable[Seque
     """Show RGB or packed frames one after the other; `likely` colours of most pixels save time."""
     numbered = _number(frames, likely)
     if numbered is None:
-        raise InputError(f"more than {_MOST_COLOURS} colours are too many for a film, which has one palette")
+        raise InputError(f"a film can have at most {_MOST_COLOURS} colours, one palette")
     pictures, palette = numbered
     return Animation(range(len(pictures)), lambda index: _image(pictures[index], palette))
 

@@ -6,10 +6,10 @@ import functools
 import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from itertools import pairwise
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from PIL import Image
 
@@ -26,7 +26,7 @@ from gridworld.visualization.animation import (
 )
 from gridworld.visualization.picture import Draw, Subject
 from gridworld.world.mdp import Mdp
-from gridworld.world.sources.gymnasium_table import make_env
+from gridworld.world.sources.gymnasium_table import has_table, make_env
 
 _MOST_FRAMES = 500  # of an episode that finds no end; by then a greedy one goes round in circles
 _MOST_PIXELS = 512 * 512  # of a frame that another environment renders
@@ -56,7 +56,7 @@ def film(
     """
     if isinstance(env, GymnasiumConfig) and not is_trusted:
         tell(
-            printable(f"the episode is drawn from the run's tables; {env.id} itself is made with trust only")
+            printable(f"the episode is drawn from the run's tables; {env.id} itself is only drawn with trust")
         )
     elif isinstance(env, GymnasiumConfig):
         try:
@@ -81,46 +81,72 @@ def rendered_frames(
     An environment with a transition table is put into each state. Others are enumerated: from a reset on, the
     actions that lead through the states are taken.
     """
-    with _off_screen():
-        real = make_env(env.id, dict(env.kwargs), render_mode="rgb_array")
+    frames = []
+    with _off_screen(), closing(RealEnv(env, mdp)) as real:
+        for states in walks:
+            real.reset(states[0])
+            frames.append(real.frame(most_pixels))
+            for before, state in pairwise(states):
+                real.follow(state, None if real.has_table else _leading(mdp, before, state))
+                frames.append(real.frame(most_pixels))
+    return frames
+
+
+def _leading(mdp: Mdp, before: int, state: int) -> int:
+    """The action that leads from one state to another."""
+    leading = np.flatnonzero(mdp.next_state[before, :, 0] == state)
+    if not leading.size:
+        raise InputError(
+            f"{mdp.name}: no action leads from {mdp.state_name(before)} to {mdp.state_name(state)}"
+        )
+    return int(leading[0])
+
+
+class RealEnv:
+    """An environment of Gymnasium that draws the states of its world."""
+
+    def __init__(self, env: GymnasiumConfig, mdp: Mdp) -> None:
+        self._id, self._mdp = env.id, mdp
+        self._env = make_env(env.id, dict(env.kwargs), render_mode="rgb_array")
+        self.has_table = has_table(self._env.unwrapped)
+
+    def reset(self, state: int) -> None:
+        """Start an episode in a start state."""
+        with self._rendering():
+            self._env.reset(seed=0)
+            if self.has_table:
+                self.follow(state)
+
+    def follow(self, state: int, action: int | None = None) -> None:
+        """Go on to a state: by the table, else by the action that leads there."""
+        real: Any = self._env.unwrapped
+        if self.has_table:
+            real.s, real.lastaction = int(self._mdp.number[state]), action
+            return
+        with self._rendering():
+            self._env.step(action)
+
+    def frame(self, most_pixels: int = _MOST_PIXELS) -> Frame:
+        """Its picture (height, width, 3), RGB, scaled down where it has more pixels."""
+        with self._rendering():
+            frame = np.asarray(self._env.render(), dtype=np.uint8)
+            height, width = frame.shape[:2]
+        if height * width <= most_pixels:
+            return frame.copy()
+        scale = (most_pixels / (height * width)) ** 0.5
+        size = max(1, int(width * scale)), max(1, int(height * scale))
+        return np.asarray(Image.fromarray(frame).resize(size, Image.Resampling.BOX))
+
+    @contextmanager
+    def _rendering(self) -> Iterator[None]:
         try:
-            frames = []
-            for states in walks:
-                real.reset(seed=0)
-                frames += [_frame(real, most_pixels) for _ in _walk(real, mdp, states)]
-            return frames
-        except InputError:
-            raise
+            yield
         except Exception as error:  # whatever it raises
-            raise InputError(f"env.id={env.id}: cannot be rendered: {in_short(error)}") from error
-        finally:
-            real.close()
+            raise InputError(f"env.id={self._id}: cannot be rendered: {in_short(error)}") from error
 
-
-def _frame(env: gym.Env[Any, Any], most_pixels: int) -> Frame:
-    frame = np.asarray(env.render(), dtype=np.uint8)
-    height, width = frame.shape[:2]
-    if height * width <= most_pixels:
-        return frame.copy()
-    scale = (most_pixels / (height * width)) ** 0.5
-    size = max(1, int(width * scale)), max(1, int(height * scale))
-    return np.asarray(Image.fromarray(frame).resize(size, Image.Resampling.BOX))
-
-
-def _walk(env: gym.Env[Any, Any], mdp: Mdp, states: Sequence[int]) -> Iterator[None]:
-    """Put the environment into one state after the other."""
-    real: Any = env.unwrapped
-    for before, state in zip([None, *states], states, strict=False):
-        if hasattr(real, "P"):
-            real.s, real.lastaction = int(mdp.number[state]), None
-        elif before is not None:
-            leading = np.flatnonzero(mdp.next_state[before, :, 0] == state)
-            if not leading.size:
-                raise InputError(
-                    f"{mdp.name}: no action leads from {mdp.state_name(before)} to {mdp.state_name(state)}"
-                )
-            env.step(int(leading[0]))
-        yield
+    def close(self) -> None:
+        """Close the environment."""
+        self._env.close()
 
 
 @contextmanager

@@ -164,12 +164,12 @@ def check_size(film: Animation, formats: Collection[str]) -> None:
     width, height = film.size
     if "apng" in formats and len(film) * width * height > MOST_APNG_PIXELS:
         raise InputError(
-            f"apng: {len(film)} pictures of {width} x {height} pixels are too many for one file; "
-            "take smaller cells, fewer episodes, or gif"
+            f"apng: {len(film)} pictures of {width} x {height} pixels are too many for one file; use "
+            "smaller cells, fewer episodes, or gif"
         )
     if "mp4" in formats and width * height > MOST_MP4_PIXELS:
         raise InputError(
-            f"mp4: {width} x {height} pixels are too many for a video; take smaller cells, or gif"
+            f"mp4: {width} x {height} pixels are too many for a video; use smaller cells, or gif"
         )
 
 

@@ -27,7 +27,7 @@ from gridworld.envs.rendering import (
 )
 from gridworld.visualization.animation import animation_of_frames
 from gridworld.visualization.canvas import Canvas, directions, greedy_paths, moving_actions
-from gridworld.visualization.picture import Draw, Moment, Subject, agents_gamma, visits_of
+from gridworld.visualization.picture import Draw, Moment, Subject, agents_gamma
 from gridworld.visualization.sheet import (
     BLUES,
     DISAGREES,
@@ -59,7 +59,7 @@ _NO_OPTIMUM = "no finite optimum"
 
 def policy(subject: Subject) -> Draw:
     """The map of the subject's greedy policy."""
-    mdp, snapshot, visits = subject.evaluator.mdp, subject.snapshot, visits_of(subject)
+    mdp, snapshot, visits = subject.evaluator.mdp, subject.snapshot, subject.visits
     optimal, known = subject.evaluator.solution.optimal, explored(mdp, visits)
     caption = _policy_caption(subject, subject.steps)
     if board_of(mdp).panels:
@@ -78,7 +78,7 @@ def policy(subject: Subject) -> Draw:
 
 
 def learning(subject: Subject) -> Draw:
-    """The policy map, or table, over training as an animation of one size, with one scale of colours."""
+    """The policy map over training, in cells of `recording.cell_size`, or the table; one colour scale."""
     assert subject.history is not None
     mdp, optimal = subject.evaluator.mdp, subject.evaluator.solution.optimal
     moments = subject.history.moments()
@@ -86,7 +86,8 @@ def learning(subject: Subject) -> Draw:
     states = np.flatnonzero(board.floor) if board.panels else table_states(mdp, subject.visits)
     visited = states[known[states]]
     scale = linear(VIRIDIS, np.stack([moment.values[visited] for moment in moments]))
-    cell_size = fitting_cell_size(mdp, _LEARNING_SIDE if len(board.panels) <= 1 else _LEARNING_MOSAIC_SIDE)
+    side = _LEARNING_SIDE if len(board.panels) <= 1 else _LEARNING_MOSAIC_SIDE
+    cell_size = subject.config.recording.cell_size or fitting_cell_size(mdp, side)
 
     def sheet(moment: Moment) -> Sheet:
         values, greedy = moment.values.astype(np.float64), moment.greedy
@@ -114,7 +115,7 @@ def q_error(subject: Subject) -> Draw:
     if board_of(mdp).panels:
         return lambda cell_size: draw_error_map(mdp, error, caption, cell_size)
     columns = ["V"] if snapshot.q is None else mdp.action_names
-    table = StateTable(mdp, table_states(mdp, visits_of(subject)), columns)
+    table = StateTable(mdp, table_states(mdp, subject.visits), columns)
     picture = table.draw_numbers(
         error, linear(ORANGES, error[table.states], low=0.0), "error", _NO_OPTIMUM, caption
     )
@@ -124,6 +125,7 @@ def q_error(subject: Subject) -> Draw:
 def visits(subject: Subject) -> Draw:
     """The map of how often training took an action in each state."""
     mdp, counts = subject.evaluator.mdp, subject.visits
+    assert counts is not None
     caption = f"where {counts.sum():,} training steps were taken"
     if board_of(mdp).panels:
         return lambda cell_size: draw_visit_map(mdp, counts, caption, cell_size)
@@ -186,7 +188,8 @@ def draw_policy_map(
         draw.circle(canvas.world, inks[state], point, round(0.2 * length))
         if letter >= SMALLEST_TEXT:
             name = mdp.action_names[greedy[state]]
-            canvas.write(name[:1].upper(), point, letter, colours[state].tolist())
+            # An animation has one palette, which smooth letters in all colours of the scale would overfill.
+            canvas.write(name[:1].upper(), point, letter, colours[state].tolist(), smooth=scale is None)
     canvas.write_numbers(
         *(values[:, None], known[:, None], colours[:, None], own.high, size),
         lambda state, _: canvas.point(state, 0.5, 0.83),
@@ -211,6 +214,18 @@ def _arrow(x: float, y: float, down: int, right: int, size: float) -> list[Point
         (x + size * (along * to_right - across * to_down), y + size * (along * to_down + across * to_right))
         for along, across in _ARROW
     ]
+
+
+def draw_optimal_actions(canvas: Canvas, optimal: BoolArray) -> None:
+    """Draw an arrow for each optimal action (S, A), outwards from the middle; a dot for one that stays."""
+    ways, draw = directions(canvas.mdp), drawing.import_pygame().draw
+    for state, action in np.argwhere(optimal & canvas.board.floor[:, None]).tolist():
+        down, right = ways[state, action].tolist()
+        point, length = canvas.point(state, 0.5 + 0.25 * right, 0.5 + 0.25 * down), 0.6 * canvas.cell
+        if down or right:
+            draw.polygon(canvas.world, INK, _arrow(*point, down, right, length))
+        else:
+            draw.circle(canvas.world, INK, point, length / 5)
 
 
 def _finish_policy_table(
@@ -254,7 +269,8 @@ def draw_visit_map(
     mdp: Mdp, visits: NDArray[np.int64], caption: str = "", cell_size: int | None = None
 ) -> Frame:
     """Draw counts (S, A) as colours, on a logarithmic scale where they span decades."""
-    counts = visits.sum(axis=1, keepdims=True)
-    scale = counting(BLUES, counts[board_of(mdp).floor])
+    board = board_of(mdp)
+    counts = board.summed(visits.sum(axis=1))[:, None]
+    scale = counting(BLUES, counts[board.floor])
     numbers = np.where(counts > 0, counts, np.nan)
     return Canvas(mdp, cell_size).draw_numbers(numbers, scale, "visits", "never", caption)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from gridworld.agents import PolicySnapshot
 from gridworld.config.train import TrainConfig
 from gridworld.envs.rendering import Frame
-from gridworld.errors import InputError
 from gridworld.storage.serialization import State
 from gridworld.visualization.animation import Animation
 from gridworld.world.evaluation import Evaluator
@@ -86,46 +85,22 @@ class PolicyHistory:
         self._last = moments[-1] if moments else None
 
 
-class Subject(Protocol):
+@dataclass(frozen=True, eq=False)
+class Subject:
     """What pictures are of: an agent after some training in its world."""
 
-    @property
-    def config(self) -> TrainConfig: ...
-
-    @property
-    def is_trusted(self) -> bool:
-        """Whether the environment that the settings name may be made, which runs its code."""
-
-    @property
-    def evaluator(self) -> Evaluator: ...
-
-    @property
-    def snapshot(self) -> PolicySnapshot: ...
-
-    @property
-    def steps(self) -> int:
-        """How many environment steps it was trained for."""
-
-    @property
-    def visits(self) -> NDArray[np.int64]:
-        """(S, A), how often training took each action in each state; InputError where a run has none."""
-
-    @property
-    def history(self) -> PolicyHistory | None:
-        """The policy over training, where it was kept."""
+    config: TrainConfig
+    is_trusted: bool  # whether the environment that the settings name may be made, which runs its code
+    evaluator: Evaluator
+    snapshot: PolicySnapshot
+    steps: int  # environment steps that it was trained for
+    visits: NDArray[np.int64] | None  # (S, A), how often it acted so while it learnt; None: not known
+    history: PolicyHistory | None = None  # the policy over training, where it was kept
 
 
 def agents_gamma(subject: Subject) -> float:
     """The discount that the agent learns with; the evaluation's where it has none of its own."""
     return float(getattr(subject.config.agent, "gamma", subject.evaluator.solution.gamma))
-
-
-def visits_of(subject: Subject) -> NDArray[np.int64] | None:
-    """The subject's visits; None where the run has none, for pictures that can be drawn without."""
-    try:
-        return subject.visits
-    except InputError:
-        return None
 
 
 def drawer(name: str) -> Callable[[Subject], Draw]:

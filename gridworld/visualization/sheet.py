@@ -156,10 +156,16 @@ class Sheet:
             self.write(short(float(numbers[state, part]), high), middle(state, part), size, ink, plate)
 
     def write(
-        self, text: str, middle: Point, size: int, ink: Colour, plate: ColourArray | None = None
+        self,
+        text: str,
+        middle: Point,
+        size: int,
+        ink: Colour,
+        plate: ColourArray | None = None,
+        smooth: bool = True,
     ) -> None:
-        """Write a text around a point of `world`, on a plate of that colour."""
-        image = font(size).render(text, True, ink)
+        """Write a text around a point of `world`, on a plate of that colour; not `smooth`: in one colour."""
+        image = font(size).render(text, smooth, ink)
         box = image.get_rect(center=middle)
         if plate is not None:
             self.world.fill(plate.tolist(), box)

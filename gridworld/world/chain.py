@@ -253,7 +253,7 @@ def discounted_visits(chain: Chain, gamma: float, stops: BoolArray) -> FloatArra
 def check_gamma(gamma: float) -> float:
     """A discount as a float, from 0 to 1 and not so near to 1 that the cost of a step is lost in rounding."""
     if isinstance(gamma, bool) or not isinstance(gamma, int | float | np.number) or not 0 <= gamma <= 1:
-        raise InputError(f"gamma={gamma!r}: a discount must be a number from 0 to 1")
+        raise InputError(f"gamma={gamma!r}: must be a number from 0 to 1")
     discount("gamma", float(gamma))
     return float(gamma)
 
@@ -273,8 +273,8 @@ def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
         raise InputError(f"policy={policy!r}: must be a table of action probabilities") from None
     if table.shape != (mdp.num_states, mdp.num_actions):
         raise InputError(
-            f"policy of shape {table.shape}: this world needs ({mdp.num_states}, {mdp.num_actions}), "
-            "a row of action probabilities per state"
+            f"policy of shape {table.shape}: this world needs ({mdp.num_states}, {mdp.num_actions}), action "
+            "probabilities per state"
         )
     total = table.sum(axis=1, keepdims=True)
     wrong = ~((table >= 0).all(axis=1) & (np.abs(total[:, 0] - 1) <= 1e-4))

@@ -21,7 +21,7 @@ _QUICKLY_SOLVED = 20_000  # outcomes of all states and actions: a few tenths of 
 REGRET_TOLERANCE = 1e-6  # relative; a detour of one step costs at least 1 % at the default discount
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Score:
     """Exact scores of one policy, in expectation over starts."""
 
@@ -34,6 +34,12 @@ class Score:
     def shortfall(self) -> float:
         """The regret without its rounding: 0 where no policy is better. By it policies are ranked."""
         return 0.0 if self.certified else self.regret
+
+    def __repr__(self) -> str:
+        """The numbers with four digits; a regret that is 0 but for rounding is 0."""
+        numbers = {"value": self.value, "regret": self.shortfall, **vars(self.outcome)}
+        shown = (f"{name}={number + 0.0:.4g}" for name, number in numbers.items())  # -0 as 0
+        return f"Score(certified={self.certified}, {', '.join(shown)})"
 
 
 class Evaluator:

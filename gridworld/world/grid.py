@@ -75,7 +75,8 @@ def compile_mdp(
     """
     if not isinstance(layout, Layout):
         raise InputError(
-            f"layout={layout!r:.50}: must be a map, as `load` reads one; `compile_env` takes names"
+            f"layout={layout!r:.50}: must be a Layout; load({layout!r:.50}) reads a map by name or file, and "
+            f"compile_env({layout!r:.50}) compiles the world of that name, with its rewards"
         )
     slip = finite("slip", slip)
     if not 0 <= slip <= 1:
@@ -85,8 +86,8 @@ def compile_mdp(
     step_reward, goal_reward, trap_reward = rewards.values()
     if layout.cliffs and trap_reward > 0:
         raise InputError(
-            f"trap_reward={trap_reward}: must be at most 0 where the map has a cliff, "
-            "from which the agent may fall again and again"
+            f"trap_reward={trap_reward}: must be at most 0 on maps with a cliff, since the agent may fall "
+            "again and again"
         )
     goal, trap, wall, cliff = (
         _mask(layout, cells) for cells in (layout.goals, layout.traps, layout.walls, layout.cliffs)
@@ -147,11 +148,9 @@ def mdp_or_compiled(
         given = load(layout, None if rows == NUM_ROWS else rows, None if cols == NUM_COLS else cols)
         return compile_mdp(given, slip, step_reward, goal_reward, trap_reward)
     if not isinstance(mdp, Mdp):
-        raise InputError(f"mdp={str(mdp)[:50]}: must be a compiled world, as `compile_mdp` makes one")
+        raise InputError(f"mdp={str(mdp)[:50]}: must be a compiled world, as from `compile_mdp`")
     if described != (CLASSIC, NUM_ROWS, NUM_COLS, 0.0, 0.0, 1.0, -1.0):
-        raise InputError(
-            f"mdp={mdp.name}: is compiled with its layout, slip and rewards; leave these arguments out"
-        )
+        raise InputError(f"mdp={mdp.name}: has its own layout, slip and rewards; leave these arguments out")
     return mdp
 
 

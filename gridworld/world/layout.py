@@ -88,8 +88,8 @@ def classic(num_rows: int = NUM_ROWS, num_cols: int = NUM_COLS) -> Layout:
     num_rows, num_cols = positive_int("num_rows", num_rows), positive_int("num_cols", num_cols)
     if num_rows < LEAST_ROWS or num_cols < LEAST_COLS:
         raise InputError(
-            f"layout classic of {num_rows} x {num_cols} cells: cannot hold the goal, its traps and a way to "
-            f"it; give at least {LEAST_ROWS} rows and {LEAST_COLS} columns"
+            f"layout classic of {num_rows} x {num_cols} cells: has no room for the goal, its traps and a "
+            f"way to it; give at least {LEAST_ROWS} rows and {LEAST_COLS} columns"
         )
     row, col = num_rows // 2, num_cols - 2
     traps = ((row + 1, col), (row, col - 1), (row - 1, col))
@@ -109,14 +109,14 @@ def parse(text: str, name: str) -> Layout:
         for col, tile in enumerate(line):
             if tile not in found:
                 raise InputError(
-                    f"{name}: row {row + 1}, column {col + 1}: unknown tile {tile!r}; "
-                    "known are S (start), G (goal), T (trap), C (cliff), # (wall) and . (floor)"
+                    f"{name}: row {row + 1}, column {col + 1}: unknown tile {tile!r}; use S (start), G "
+                    "(goal), T (trap), C (cliff), # (wall) and . (floor)"
                 )
             found[tile].append((row, col))
         if len(line) != len(lines[0]):
             raise InputError(
-                f"{name}: row {row + 1} has {len(line)} columns, row 1 has {len(lines[0])}; "
-                "all rows must be equally long"
+                f"{name}: row {row + 1} has {len(line)} columns, row 1 has {len(lines[0])}; all rows must "
+                "have equal lengths"
             )
     starts, goals, traps, cliffs = (tuple(found[tile]) for tile in "SGTC")
     return Layout(name, len(lines), len(lines[0]), starts, goals, traps, frozenset(found["#"]), cliffs)
@@ -142,8 +142,8 @@ def load(
         actual = getattr(loaded, what)
         if asked is not None and positive_int(what, asked) != actual:
             raise InputError(
-                f"{what}={asked}: the map {loaded.name} has {actual}; leave {what} out, "
-                "it only sizes the layout classic"
+                f"{what}={asked}: the map {loaded.name} has {actual}; leave {what} out, it only applies to "
+                "the layout classic"
             )
     return loaded
 
@@ -178,7 +178,7 @@ def _read(layout: str | PathLike[str]) -> Layout:
         if raw is None:
             raise InputError(f"layout {given!r}: is not an ordinary file; give a readable text file")
         if len(raw) > 4 * MAX_CELLS:
-            raise InputError(f"{given}: the map is too large; at most {MAX_CELLS} cells fit")
+            raise InputError(f"{given}: the map is too large; at most {MAX_CELLS} cells are allowed")
         return parse(raw.decode("utf-8-sig"), name=given)
     except UnicodeDecodeError as error:
         raise InputError(f"{given}: not a text file (byte {error.start + 1} is not UTF-8)") from None
@@ -215,13 +215,13 @@ def _check(layout: Layout) -> None:
         for row, col in getattr(layout, f"{what}s"):
             where = f"row {row + 1}, column {col + 1}"
             if not (0 <= row < layout.num_rows and 0 <= col < layout.num_cols):
-                raise refused(f"{where}: this {what} lies outside the grid", "move it inside")
+                raise refused(f"{where}: this {what} is outside the grid", "move it inside")
             if (row, col) in kind:
                 raise refused(f"{where}: a {what} on a {kind[row, col]}", "a cell can be one thing only")
             kind[row, col] = what
     if layout.cliffs and len(layout.starts) > 1:
         raise refused(
-            f"a cliff 'C' sends back to the start, and there are {len(layout.starts)}", "leave one 'S'"
+            f"a cliff 'C' leads back to the start, but there are {len(layout.starts)}", "keep one 'S'"
         )
     reaching = _cells_that_reach_a_goal(layout)
     for row, col in [cell for cell in layout.starts if cell not in reaching]:

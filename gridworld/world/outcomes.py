@@ -164,13 +164,13 @@ def check_size(name: str, states: int, actions: int, outcomes: int) -> None:
     if states > MOST_STATES or actions > MOST_ACTIONS:
         raise InputError(
             f"{name}: {states:,} states and {actions:,} actions are too many; at most {MOST_STATES:,} "
-            f"states and {MOST_ACTIONS} actions can be solved for"
+            f"states and {MOST_ACTIONS} actions can be solved"
         )
     size = states * actions * outcomes * _BYTES
     if size > _MOST_BYTES:
         raise InputError(
             f"{name}: {states:,} states, {actions:,} actions and {outcomes:,} outcomes of each would take "
-            f"{size / 2**30:,.1f} GiB of memory; at most {_MOST_BYTES / 2**30:.0f} GiB can be solved for"
+            f"{size / 2**30:,.1f} GiB of memory; at most {_MOST_BYTES / 2**30:.0f} GiB can be solved"
         )
     check_memory(name, size)
 
@@ -265,7 +265,7 @@ def _check_extras(
     if places is not None and (places.shape != (size, 3) or places.dtype.kind not in "iu"):
         raise InputError(
             f"{name}: places is {places.dtype} {places.shape}, must be whole numbers ({size}, 3): panel, "
-            "row and column of each state"
+            "row and column per state"
         )
     if shown is not None and shown.shape[:1] != (size,):
         raise InputError(f"{name}: own_observation has shape {shown.shape}, must begin with {size} states")
@@ -336,10 +336,10 @@ def _check_states(mdp: Mdp, where: str) -> None:
     fine[:, :, 1:] &= mdp.thresholds[:, :, 1:] >= mdp.thresholds[:, :, :-1]
     number = mdp.number
     for wrong, mistake in (
-        (mdp.terminal & ~mdp.absorbing, "is terminal and not absorbing"),
-        (mdp.absorbing & ~(stays & unpaid), "is absorbing and goes on, or pays"),
-        (mdp.goal & ~mdp.terminal, "is a goal and not terminal"),
-        (mdp.terminal & (mdp.start > 0), "is terminal and a start"),
+        (mdp.terminal & ~mdp.absorbing, "is terminal but not absorbing"),
+        (mdp.absorbing & ~(stays & unpaid), "is absorbing, but has a successor or a reward"),
+        (mdp.goal & ~mdp.terminal, "is a goal but not terminal"),
+        (mdp.terminal & (mdp.start > 0), "is terminal and also a start"),
         (~fine.all(axis=(1, 2)), "has thresholds that are not the sums of its probabilities"),
         ((number < 0) | (number >= len(number)), f"has a number that is not from 0 to {len(number) - 1}"),
         (() if mdp.places is None else (mdp.places < -1).any(axis=1), "has a place below -1"),

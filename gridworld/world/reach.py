@@ -39,8 +39,8 @@ from gridworld.world.reading import (
 )
 
 SO_UNKNOWN = (
-    ", so what it makes of the task is not exactly known; "
-    "leave it out, or make it a function of its argument alone"
+    ", so its effect on the task is not exactly known; leave it out, or make it a function of its argument "
+    "alone"
 )
 _IMPURE = {  # of what is built in
     *("open", "input", "eval", "exec", "compile", "__import__", "globals", "locals", "vars", "id"),
@@ -299,12 +299,12 @@ class _Copy:
             return copy.deepcopy(self._method(copy.deepcopy(argument)))
         finally:
             if looked_for := self._below["looked_for"]:
-                raise _MemoryError(f"looks into the environment below it (at {looked_for[0]})") from None
+                raise _MemoryError(f"reads from the environment below it ({looked_for[0]})") from None
 
 
 def _check_in_turn(where: str, owner: Any, method: str, arguments: Sequence[Any], found: list[Any]) -> None:
     """Ask a method that writes something about every argument after every other, and after a long time."""
-    memory = _MemoryError("keeps a memory or draws random numbers")
+    memory = _MemoryError("keeps memory or draws random numbers")
     if len(arguments) > _MOST_IN_TURN:
         raise memory
     expected = dict(enumerate(found))

@@ -270,8 +270,8 @@ def _resting_policy(mdp: Mdp) -> IntArray:
     going_on = _staying(mdp, possible, playing, np.ones(possible.shape[:2], dtype=np.bool_))
     if (going_on & (possible & (mdp.reward > 0)).any(axis=2)).any():
         raise InputError(
-            f"gamma=1 in {mdp.name}: who goes on for ever is paid on the way, so that the return may grow "
-            "without end; take a gamma below 1, or rewards of at most 0 on the way, e.g. env.step_reward=0"
+            f"gamma=1 in {mdp.name}: an episode that never ends collects rewards, so the return may be "
+            "infinite; use a gamma below 1, or rewards of at most 0 on the way, e.g. env.step_reward=0"
         )
     free = ~np.asarray((possible & (mdp.reward != 0)).any(axis=2))
     resting = _staying(mdp, possible, playing, free)

@@ -90,16 +90,16 @@ def role_of(where: str, wrapper: gym.Wrapper[Any, Any, Any, Any]) -> str:
     name, role = type(wrapper).__name__, known_class(wrapper, _ROLES, STEPPED_BY)
     if role is None:
         raise InputError(
-            f"{where}: its wrapper {name} has its own step() or reset(), or changes how they are found, so "
-            "nothing exact is known of it; leave it out, or make it a gymnasium ObservationWrapper, "
+            f"{where}: its wrapper {name} has its own step() or reset(), or changes access to them, so it "
+            "cannot be solved exactly; leave it out, or make it a gymnasium ObservationWrapper, "
             "RewardWrapper or ActionWrapper that defines only observation(), reward() or action()"
         )
     for what, changing in (("observation", ("observation", MEMORY)), ("action", ("action",))):
         inner, outer = (getattr(each, f"{what}_space") for each in (wrapper.env, wrapper))
         if outer != inner and role not in changing:
             raise InputError(
-                f"{where}: its wrapper {name} changes the {what} space and is no "
-                f"gymnasium.{what.title()}Wrapper, so what becomes of an {what} is not known; make it one"
+                f"{where}: its wrapper {name} changes the {what} space but is not a "
+                f"gymnasium.{what.title()}Wrapper, so its effect is unknown; make it one"
             )
     return role
 
@@ -110,8 +110,8 @@ def refuse_transformed(where: str, env: gym.Env[Any, Any]) -> None:
         if (role := role_of(where, wrapper)) not in (NEUTRAL, LIMIT):
             changed = "observation" if role == MEMORY else role
             raise InputError(
-                f"{where}: its wrapper {type(wrapper).__name__} changes {changed}s, so the environment "
-                "below it, of which the truth is known, is not what an agent is in; leave it out"
+                f"{where}: its wrapper {type(wrapper).__name__} changes {changed}s, so the known "
+                "environment below it is not what the agent is in; leave it out"
             )
 
 
@@ -149,16 +149,15 @@ class Wrapped:
         """What an agent sees of each state: S of them, arrays or of any other kind."""
         if self.memory:
             raise InputError(
-                f"{self._where}: {self.memory[0]} makes observations of more than the state's number, so no "
-                "table of the policy can be evaluated exactly; leave it out"
+                f"{self._where}: {self.memory[0]} makes observations that depend on more than the state, so "
+                "no policy can be evaluated exactly; leave it out"
             )
         rows: list[Any] = self._bare.number.tolist()
 
         def compare(number: int, observation: Any) -> None:
             if not same(rows[number], observation):
                 raise InputError(
-                    f"{self._where}: what is seen of state {number} through its wrappers is not always the "
-                    f"same{SO_UNKNOWN}"
+                    f"{self._where}: its wrappers do not always show the same of state {number}{SO_UNKNOWN}"
                 )
 
         if self.transforms:
@@ -177,7 +176,7 @@ class Wrapped:
         masks, chain = env.get_wrapper_attr("action_masks"), [*wrappers_of(env), env.unwrapped]
         if self._attribute is None:
             raise InputError(
-                f"{self._where}: action_masks() cannot be asked for each state, since the state of "
+                f"{self._where}: action_masks() is not available for each state, since the state of "
                 f"{type(env.unwrapped).__name__} cannot be set; use a model without masks"
             )
         within = [
@@ -190,7 +189,7 @@ class Wrapped:
             with self._refusing("action_masks() failed"):
                 found[state] = masks()
                 if [each.content(is_outside=True) for each in within] != before:
-                    raise InputError(f"{self._where}: action_masks() keeps a memory{SO_UNKNOWN}")
+                    raise InputError(f"{self._where}: action_masks() keeps memory{SO_UNKNOWN}")
 
         def compare(number: int, observation: Any) -> None:
             if self._bare.acting[number] and not np.array_equal(found[number], masks()):
@@ -216,13 +215,13 @@ class Wrapped:
                 except Exception as error:
                     raise InputError(
                         f"{self._where}: its wrapper {kind.__name__} cannot be copied ({in_short(error)}), "
-                        "so what it changes cannot be found out; leave it out"
+                        "so its effect cannot be determined; leave it out"
                     ) from None
                 other.env, env = env, other
             seen[id(wrapper)] = env
         with self._refusing("cannot be reset"):
             env.reset()
-        return env  # type: ignore[no-any-return]
+        return env
 
     @contextmanager
     def _refusing(self, what: str) -> Iterator[None]:
@@ -253,7 +252,7 @@ class Wrapped:
         for action, inner in enumerate(chosen):
             if not isinstance(inner, int) or inner not in range(mdp.num_actions):
                 raise InputError(
-                    f"{self._where}: {name} makes {str(inner)[:50]} of action {action}; must be "
+                    f"{self._where}: {name} turns action {action} into {str(inner)[:50]}; must be "
                     f"{mdp.action_choices()}"
                 )
         tables = ("next_state", "probability", "reward")
@@ -289,9 +288,8 @@ class Wrapped:
         if not possible.any():
             raise InputError(
                 f"{self._where}: through its wrappers, action {action} in state {state} led to state "
-                f"{number} with reward {reward:g}{' and ended' if terminated else ''}, which is "
-                "not what reward() and action() gave when they were asked; make them functions of their "
-                "argument alone"
+                f"{number} with reward {reward:g}{' and ended' if terminated else ''}, which differs from "
+                "what reward() and action() returned; make them functions of their argument alone"
             )
 
 

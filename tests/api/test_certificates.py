@@ -327,7 +327,7 @@ def turned_lake() -> Any:
     return Turned(lake())
 
 
-_STEP, _BATCH, _ENV = "has its own step", "whose effect on the task is known", "^env: "
+_STEP, _BATCH, _ENV = "has its own step", "is not a known batch", "^env: "
 # fmt: off
 REFUSED: dict[str, tuple[Callable[[], Any], str]] = {  # what makes an environment, and what is said of it
     "one environment in two places":
@@ -342,16 +342,16 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {  # what makes an environme
     "a batch that scales": (lambda: wrappers.vector.NormalizeReward(SyncVectorEnv([lake])), _BATCH),
     "a batch that shows otherwise": (lambda: Saving([lake]), _ENV),
     "what a Monitor has counted":
-        (lambda: paying(lambda self, r: r + self.env.total_steps)(Monitor(lake())), "at total_steps"),
+        (lambda: paying(lambda self, r: r + self.env.total_steps)(Monitor(lake())), "below it .total_steps"),
     "the state, where it can be read":
-        (lambda: paying(lambda self, r: getattr(self.unwrapped, "state", r))(lake()), "at unwrapped"),
+        (lambda: paying(lambda self, r: getattr(self.unwrapped, "state", r))(lake()), "below it .unwrapped"),
     "a clock": (lambda: paid_by(lambda r: r + (time.monotonic() < 0))(lake()), "refers to time.monotonic"),
     "a step by another way": (lambda: Elusive(lake()), _STEP),
     "an environment by another way": (lambda: Indirect(lake()), _STEP),
     "a grid that is asked by another way":
         (own(gridworld.GridWorldEnv, mdp=property(lambda self: self._mdp)), _STEP),
     "copies with another function of a library":
-        (lambda: DummyVecEnv([lambda k=k: paid_by(constant(k))(lake()) for k in (1, -1)]), "is another task"),
+        (lambda: DummyVecEnv([lambda k=k: paid_by(constant(k))(lake()) for k in (1, -1)]), "a different task"),
     "what is no wrapper": (Delegating, _ENV),
     "an action that is a float":
         (lambda: wrappers.TransformAction(lake(), float, spaces.Discrete(4)), _ENV),
@@ -387,11 +387,11 @@ def test_copies_of_a_batch_must_be_one_task() -> None:
                 mixed = batch([lake, lambda other=other: other(lake())])
             except (AssertionError, RuntimeError):
                 continue  # refused by the batch itself
-            with pytest.raises(InputError, match=r"environment 1 of the .* is another task"):
+            with pytest.raises(InputError, match=r"environment 1 of the .* is a different task"):
                 gridworld.evaluate(BEST, mixed)
     for settings in ({"slip": 0.5}, {"step_reward": -0.2}, {"goal_reward": 2.0}):
         for batch in (DummyVecEnv, SyncVectorEnv):
-            with pytest.raises(InputError, match="is another task"):
+            with pytest.raises(InputError, match="is a different task"):
                 gridworld.evaluate(BEST, batch([grid, functools.partial(grid, **settings)]))
 
 
@@ -409,7 +409,7 @@ def test_environments_that_are_known() -> None:
 @pytest.mark.slow
 def test_environments_in_other_processes_are_refused() -> None:
     for batch in (SubprocVecEnv([turned_lake]), AsyncVectorEnv([turned_lake])):
-        with pytest.raises(InputError, match="in other processes, where their wrappers cannot be looked at"):
+        with pytest.raises(InputError, match="in other processes, where their wrappers cannot be inspected"):
             gridworld.evaluate(BEST, batch)
         batch.close()
 
@@ -535,7 +535,7 @@ class Clock(PPO):
 Rotating = predicting(lambda actions: (actions + 1) % 4)
 REFUSED_PREDICTS = {
     "draws random numbers": predicting(lambda a: (a + np.random.randint(0, 4, np.shape(a))) % 4),
-    "different actions in one state": predicting(lambda a: np.full_like(a, a if np.ndim(a) == 0 else a[0])),
+    "always take the same action": predicting(lambda a: np.full_like(a, a if np.ndim(a) == 0 else a[0])),
     "raised": predicting(fail),
 }
 
@@ -550,7 +550,7 @@ def test_a_predict_of_its_own_is_what_is_scored() -> None:
         plain.predict = rotating.predict
         assert gridworld.evaluate(plain) == gridworld.evaluate(rotating)
     assert differ
-    with pytest.raises(InputError, match=r"has its own predict\(\), so the distribution"):
+    with pytest.raises(InputError, match=r"has its own predict\(\), so its exploring"):
         gridworld.evaluate(rotating, deterministic=False)
     for told, kind in REFUSED_PREDICTS.items():
         with pytest.raises(InputError, match=told):
@@ -567,7 +567,7 @@ def held(table: Any, env: Any = None) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"), [(Sampling, "draws random numbers"), (Clock, "keeps a state from step to step")]
+    ("kind", "told"), [(Sampling, "draws random numbers"), (Clock, "keeps a state between steps")]
 )
 def test_a_predict_that_draws_or_keeps_time_is_refused(kind: type, told: str) -> None:
     model = held(BEST)
@@ -632,7 +632,7 @@ class Forwarding(MaskablePPO):
 
 def test_masks_that_are_no_function_of_the_state_or_differ_are_refused() -> None:
     for make in ([by_last_action], [lambda: forbidding(0), lambda: forbidding(1)]):
-        with pytest.raises(InputError, match=r"action_masks\(\) does not always|masks actions otherwise"):
+        with pytest.raises(InputError, match=r"action_masks\(\) does not always|masks actions differently"):
             gridworld.evaluate(MaskablePPO("MlpPolicy", DummyVecEnv(make), n_steps=8, device="cpu"))
     one, two = (
         kind("MlpPolicy", forbidding(1), n_steps=8, seed=3, device="cpu")
@@ -688,7 +688,7 @@ def test_observations_are_what_a_batch_makes_of_them() -> None:
 
     assert gridworld.evaluate(held(BEST, halves(np.float32))).certified
     model = PPO("MlpPolicy", halves(np.uint8), device="cpu")
-    with pytest.raises(InputError, match="give the space the right dtype"):
+    with pytest.raises(InputError, match="correct the dtype of the space"):
         gridworld.evaluate(model)
 
 
@@ -729,7 +729,7 @@ def test_an_encoding_of_ones_own_is_not_taken_for_ours_by_its_space() -> None:
 
     model = held(BEST, reversed_rows())
     for other in (grid(), gridworld.load("frozen_lake_4x4"), gridworld.compile_env(reversed_rows())):
-        with pytest.raises(InputError, match="only has the same space"):
+        with pytest.raises(InputError, match="merely has the same space"):
             gridworld.evaluate(model, other)
     ours = held(BEST, gridworld.OneHotObservation(grid()))
     assert gridworld.evaluate(ours, gridworld.load("frozen_lake_4x4")) == gridworld.evaluate(ours)
@@ -776,7 +776,7 @@ class Times(gym.RewardWrapper[Any, Any]):
 
 def test_copies_that_differ_in_a_custom_attribute_are_refused() -> None:
     copies = DummyVecEnv([lambda: Times(lake(), 1.0), lambda: Times(lake(), -1.0)])
-    with pytest.raises(InputError, match="environment 1 of the DummyVecEnv is another task"):
+    with pytest.raises(InputError, match="environment 1 of the DummyVecEnv is a different task"):
         gridworld.evaluate(np.ones(16, dtype=int), copies)
     alike = DummyVecEnv([lambda: Times(lake(), 2.0)] * 2)
     assert gridworld.evaluate(np.ones(16, dtype=int), alike).regret == pytest.approx(2 * 0.99**5)

@@ -16,10 +16,10 @@ from helpers.support import CONF, SHORT, configure, script
 from hydra.core.global_hydra import GlobalHydra
 from hydra.version import getbase
 from omegaconf import OmegaConf
+from PIL import Image
 
 import gridworld
 from gridworld import InputError
-from gridworld.agents import family
 from gridworld.training.session import Session
 
 TIMES = ("train_seconds", "evaluation_seconds")
@@ -46,7 +46,7 @@ def test_bit_for_bit_what_the_command_does(agent: str, tmp_path: Path) -> None:
 
     assert (tmp_path / "mine" / "curve.csv").read_bytes() == (theirs / "curve.csv").read_bytes()
     expected = timeless(json.loads((theirs / "summary.json").read_text()))
-    weights = family(kept.config.agent).weights
+    weights = kept.config.agent.weights
     of_command, of_call = (weights(each / "model.zip", 10**8) for each in (theirs, tmp_path / "mine"))
     assert of_command.keys() == of_call.keys()
     assert all(np.array_equal(of_command[name], of_call[name]) for name in of_command)
@@ -109,6 +109,24 @@ def test_what_a_result_has() -> None:
     assert "certified since step 0" in repr(table)
 
 
+def test_a_run_shows_itself(run: gridworld.RunResult) -> None:
+    figure = run.plot("regret")
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names[:3] == ["greedy", "with exploration", "optimum"]
+    drawn = {tuple(line.get_ydata()) for line in figure.axes[0].lines}
+    assert tuple(run.curve["regret"]) in drawn
+    with pytest.raises(InputError, match="metric='speed': no such curve; choose from value, regret"):
+        run.plot("speed")
+    with Image.open(Path(run.folder or "") / "policy.png") as picture:
+        assert np.array_equal(np.asarray(picture), np.asarray(run.policy_map()))
+    html = run._repr_html_()
+    assert html.count('<img src="data:image/png;base64,') == 2
+    assert "<b>certified optimal since step 2,000</b>" in html
+    run.summary["agent"] = "<b>x</b>"
+    assert "<b>x</b>" not in run._repr_html_()
+    run.summary["agent"] = "q_learning"
+
+
 def test_settings_are_those_of_the_command_line() -> None:
     words = ["agent=ppo", "env=four_rooms", "seed=3", "agent.gamma=0.9"]
     by_call = gridworld.compose("agent=ppo", {"env": "four_rooms", "agent.gamma": 0.9}, seed=np.int64(3))
@@ -126,13 +144,13 @@ def test_settings_are_those_of_the_command_line() -> None:
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        (("agent=dnq",), "agent=dnq: there is no such choice; there are"),
-        (("agent.lr=3",), "Key 'lr' not in 'DQNConfig'; did you mean learning_rate?"),
+        (("agent=dnq",), "agent=dnq: no such choice; choose from"),
+        (("agent.lr=3",), "no such setting in DQNConfig; did you mean learning_rate?"),
         (({"agent.gama": 0.9},), "did you mean gamma?"),
-        (("seed=1,2",), "seed=1,2: has several values; call train once for each"),
+        (("seed=1,2",), "seed=1,2: has several values; call gridworld.sweep with them"),
         (("-m",), "-m: is not an override; write KEY=VALUE"),
         (("dqn",), "dqn: is not an override; write KEY=VALUE"),
-        (("hydra.run.dir=x",), "the run's folder is given by folder="),
+        (("hydra.run.dir=x",), "here the folder is given by folder="),
         (({"seed": {1, 2}},), "seed: must be plain values, has a set"),
         (({3: 4},), "'3': must be the name of a setting"),
         (({"a b": 4},), "'a b': must be the name of a setting"),
@@ -152,7 +170,7 @@ def test_mistakes_are_told_in_one_sentence(given: tuple[object, ...], sentence: 
 
 def test_folders_that_cannot_be_used(tmp_path: Path) -> None:
     gridworld.train("agent=value_iteration", folder=tmp_path / "run", progress=False)
-    with pytest.raises(InputError, match="holds a run already; choose another folder"):
+    with pytest.raises(InputError, match="contains a run already; choose another folder"):
         gridworld.train("agent=value_iteration", folder=tmp_path / "run", progress=False)
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="choose another folder"):
@@ -174,14 +192,14 @@ def test_ctrl_c_leaves_a_run_that_the_same_call_goes_on_with(
 
     with monkeypatch.context() as patch:
         patch.setattr(Session, "_on_step", press)
-        with pytest.raises(KeyboardInterrupt, match="the same call goes on where it was saved"):
+        with pytest.raises(KeyboardInterrupt, match="make the same call to resume"):
             gridworld.train(*words, folder=tmp_path / "run", progress=False)
         with pytest.raises(KeyboardInterrupt):
             gridworld.train(*words, progress=False)
     assert signal.getsignal(signal.SIGINT) is handler
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     assert (manifest["status"], manifest["checkpoint"]) == ("interrupted", manifest["reached"])
-    with pytest.raises(InputError, match="holds an unfinished run with other settings"):
+    with pytest.raises(InputError, match="contains an unfinished run with other settings"):
         gridworld.train(*words, seed=5, folder=tmp_path / "run", progress=False)
 
     continued = gridworld.train(*words, folder=tmp_path / "run", progress=False)
@@ -251,5 +269,7 @@ def test_a_run_is_opened_within_the_budget_and_ones_own_needs_none(
     with (tmp_path / "run" / "world.npz").open("r+b") as file:
         file.truncate(500_000)
     for read in (gridworld.open_run, gridworld.diagnose):
-        with pytest.raises(InputError, match=r"world\.npz: would take about 1\.5 MB of memory, the budget"):
+        with pytest.raises(
+            InputError, match=r"world\.npz: would take about 1\.5 MB of memory, but the budget"
+        ):
             read(tmp_path / "run")

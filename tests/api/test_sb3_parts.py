@@ -118,9 +118,9 @@ def test_what_it_refuses() -> None:
         with pytest.raises(InputError):
             gridworld.ExactEvalCallback(**wrong)
     memory = RecurrentPPO("MlpLstmPolicy", gridworld.OneHotObservation(gym.make(ENV)), n_steps=128)
-    with pytest.raises(InputError, match="keeps a memory"):
+    with pytest.raises(InputError, match="keeps memory"):
         memory.learn(100, callback=gridworld.ExactEvalCallback())
-    with pytest.raises(InputError, match="has no GridWorld in it"):
+    with pytest.raises(InputError, match="contains neither a GridWorld"):
         PPO("MlpPolicy", "CartPole-v1", n_steps=64).learn(64, callback=gridworld.ExactEvalCallback())
 
 
@@ -137,17 +137,3 @@ def test_the_batch_is_one_for_sb3() -> None:
         return [float(batch.step(np.full(4, 1))[0].argmax()) for _ in range(30)]
 
     assert walk(1) == walk(1) != walk(2)
-
-
-@pytest.mark.parametrize(
-    ("named", "sentence"),
-    [
-        ({"slip": 2}, "slip=2.0: must be a probability"),
-        ({"layout": "nowhere"}, "neither a shipped layout"),
-        ({"observation": "pixels"}, "observation kind 'pixels': must be one_hot"),
-        ({"n_envs": 0}, "num_envs"),
-    ],
-)
-def test_batches_that_cannot_be(named: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
-        gridworld.make_vec_env(**named)

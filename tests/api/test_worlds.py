@@ -1,59 +1,170 @@
-"""Gymnasium's own environments in a Python program: as exact tables, as batches, and under `evaluate`."""
+"""What a world may be given as: a name, a map, an environment, a batch, a run; its tables and step limit."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from gymnasium.wrappers import FlattenObservation, TimeLimit
-from stable_baselines3 import DQN, PPO
+from helpers.support import ROOT
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 import gridworld
-from gridworld import InputError
+from gridworld import GridWorldEnv, InputError, Mdp, compile_mdp, load
+
+RAW, LAKE = "GridWorld-v0", "FrozenLake-v1"
+NEED_MORE = {"arrays", "built", "enumerated", "gymnasium"}  # env.path, env.builder, env.id
+NAMES = sorted({path.stem for path in (ROOT / "conf" / "env").glob("*.yaml")} - NEED_MORE)
 
 
-def test_compile_env_takes_whatever_holds_a_world():
-    lake = gym.make("FrozenLake-v1")
-    text = gridworld.compile_env(lake).text()
-    assert repr(gridworld.compile_env(lake)) == "<Mdp FrozenLake-v1: 16 states, 4 actions>"
-    for env in (
-        lake.unwrapped,
-        make_vec_env("FrozenLake-v1", 2),
-        gym.make_vec("FrozenLake-v1", 2, vectorization_mode="sync"),
-    ):
-        assert gridworld.compile_env(env).text() == text
-    limits = [lake, make_vec_env("FrozenLake-v1", 2), TimeLimit(lake.unwrapped, 7), lake.unwrapped]
-    assert [gridworld.compile_env(env).max_episode_steps for env in limits] == [100, 100, 7, None]
-    grid = gym.make("GridWorld-v0")
-    assert gridworld.compile_env(grid) is grid.unwrapped.mdp
+def same(first: Mdp, second: Mdp) -> bool:
+    arrays = ("next_state", "probability", "reward", "terminal", "start")
+    return all(np.array_equal(getattr(first, name), getattr(second, name)) for name in arrays)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_name_is_the_world_of_the_command_line(name: str) -> None:
+    env = gridworld.compose(f"env={name}").env
+    wanted = env.compile()
+    limit = env.step_limit(wanted)
+    world, batch = gridworld.compile_env(name), gridworld.make_vec_env(name, n_envs=2, observation="none")
+    assert same(world, wanted)
+    assert same(batch.envs.mdp, wanted)
+    assert (world.max_episode_steps, batch.envs.max_episode_steps) == (limit, limit)
+    actions = np.zeros(wanted.num_states, dtype=int)
+    exact = gridworld.evaluate(actions, wanted, max_episode_steps=limit)
+    assert gridworld.evaluate(actions, name) == exact
+    callback = gridworld.ExactEvalCallback(name)
+    assert callback.evaluator is not None
+    assert same(callback.evaluator.mdp, wanted)
+    assert callback.evaluator.max_episode_steps == limit
 
 
 @pytest.mark.parametrize(
-    ("env", "told"),
+    ("name", "limit", "places"),
     [
-        (gym.make("CartPole-v1"), "env: CartPoleEnv has no GridWorld in it and no transition table"),
-        (make_vec_env("CartPole-v1", 1), "env: CartPoleEnv has no GridWorld in it"),
-        (3, "env: int has no GridWorld in it"),
-        (gym.make("Taxi-v4", fickle_passenger=True), "Taxi-v4: fickle_passenger=True"),
+        (
+            "classic",
+            100,
+            [
+                *(gym.make(RAW), gridworld.OneHotObservation(gym.make(RAW)), GridWorldEnv(), load("classic")),
+                *(gym.make_vec(RAW, num_envs=3), gridworld.make_vec_env("classic", n_envs=2)),
+                *(DummyVecEnv([lambda: gym.make(RAW)]), compile_mdp(load("classic"))),
+            ],
+        ),
+        (
+            "classic",
+            5,
+            [
+                gym.make(RAW, max_episode_steps=5),
+                gym.make_vec(RAW, num_envs=2, max_episode_steps=5),
+                gridworld.make_vec_env(max_episode_steps=5),
+                DummyVecEnv([lambda: TimeLimit(GridWorldEnv(), 5)]),
+            ],
+        ),
+        (
+            "frozen_lake_v1",
+            100,
+            [
+                *(LAKE, gym.make(LAKE), make_vec_env(LAKE, 2)),
+                gym.make_vec(LAKE, 2, vectorization_mode="sync"),
+            ],
+        ),
+        ("frozen_lake_v1", 7, [TimeLimit(gym.make(LAKE).unwrapped, 7)]),
     ],
+    ids=lambda value: None if isinstance(value, list) else str(value),
 )
-def test_compile_env_refuses_what_it_cannot_know(env, told):
-    with pytest.raises(InputError, match=f"^{told}"):
-        gridworld.compile_env(env)
+def test_whatever_holds_a_world_is_that_world(name: str, limit: int, places: list[Any]) -> None:
+    world = gridworld.compile_env(name)
+    down = np.ones(world.num_states, dtype=int)
+    wanted = gridworld.evaluate(down, world, max_episode_steps=limit)
+    for place in places:
+        assert gridworld.evaluate(down, place) == wanted
 
 
-def test_a_batch_of_a_world_has_its_step_limit():
+def test_tables_and_step_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lake, grid = gym.make(LAKE), gym.make(RAW)
+    assert repr(gridworld.compile_env(lake)) == "<Mdp FrozenLake-v1: 16 states, 4 actions>"
+    assert gridworld.compile_env(lake.unwrapped).max_episode_steps is None
+    assert gridworld.compile_env(grid) is grid.unwrapped.mdp  # type: ignore[attr-defined]
+    monkeypatch.chdir(tmp_path)
+    Path("mine.txt").write_text("S.G\n")
+    assert gridworld.compile_env("mine.txt").num_states == 3
+    bare, cliff = gridworld.make_vec_env(layout="cliff", n_envs=1).envs.mdp, compile_mdp(load("cliff"))
+    assert same(bare, cliff)
+    assert not same(bare, gridworld.compile_env("cliff"))
+    slippery = gridworld.make_vec_env("cliff", n_envs=1, slip=0.1, max_episode_steps=7).envs
+    assert slippery.max_episode_steps == 7
+    assert same(slippery.mdp, gridworld.compose("env=cliff", "env.slip=0.1").env.compile())
+    for batch in (
+        gridworld.make_vec_env(cliff),
+        gridworld.make_vec_env(mdp=cliff),
+        gridworld.make_vec(cliff),
+    ):
+        assert getattr(batch, "envs", batch).max_episode_steps == 100
+    shorter = gridworld.make_vec(gridworld.compile_env("cliff_walking"), max_episode_steps=100)
+    assert gridworld.compile_env(shorter).max_episode_steps == 100
+    assert gridworld.make_vec(gridworld.compile_env(gym.make("CliffWalking-v1"))).max_episode_steps is None
     taxi = gridworld.compile_env(gym.make("Taxi-v4"))
     batch = gridworld.make_vec(taxi, 50)
     assert (batch.num_envs, batch.max_episode_steps, batch.single_action_space.n) == (50, 200, 6)
     states, _ = batch.reset(seed=0)
     assert (taxi.start[states] > 0).all()
     assert batch.step(np.zeros(50, dtype=int))[1].tolist() == [-1.0] * 50
-    assert gridworld.make_vec(taxi, 1, max_episode_steps=3).max_episode_steps == 3
-    assert gridworld.make_vec(gridworld.compile_env(gym.make("CliffWalking-v1"))).max_episode_steps is None
-    assert gridworld.make_vec(gridworld.compile_mdp(gridworld.load("classic"))).max_episode_steps == 100
-    with pytest.raises(InputError, match="mdp=FrozenLake: must be a compiled world"):
-        gridworld.make_vec("FrozenLake")
+    model = PPO("MlpPolicy", gridworld.make_vec_env("river_swim", n_envs=2), n_steps=8, batch_size=16)
+    assert gridworld.evaluate(model).outcome == gridworld.evaluate(model, "river_swim").outcome
+
+
+def test_a_run_is_scored_on_its_own_world() -> None:
+    run = gridworld.train(
+        "agent=q_learning", "env=cliff_walking", "evaluation.gamma=0.9", total_timesteps=500, progress=False
+    )
+    score = gridworld.evaluate(run.policy.greedy, run)
+    assert score.value == run.summary["value"]
+    assert score.outcome.timeout == pytest.approx(run.summary["timeout_probability"])
+    named = gridworld.evaluate(run.policy.greedy, "cliff_walking", gamma=0.9)
+    assert named == score
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: gridworld.evaluate([1], "clif"), "env=clif: no such world; did you mean cliff"),
+        (lambda: gridworld.evaluate([1], "Nowhere-v1"), "env.id=Nowhere-v1: "),
+        (lambda: gridworld.evaluate([1], "arrays"), "env.path: has no value"),
+        (lambda: gridworld.compile_env("nowhere"), "env=nowhere: .* one of aima_4x3, "),
+        (
+            lambda: gridworld.compile_env(gym.make("CartPole-v1")),
+            "CartPoleEnv contains neither a GridWorld nor",
+        ),
+        (
+            lambda: gridworld.compile_env(make_vec_env("CartPole-v1", 1)),
+            "CartPoleEnv contains neither a Grid",
+        ),
+        (lambda: gridworld.compile_env(3), "env: int contains neither a GridWorld"),
+        (lambda: gridworld.compile_env(gym.make("Taxi-v4", fickle_passenger=True)), "fickle_passenger=True"),
+        (lambda: gridworld.compile_mdp("classic"), "layout='classic': must be a Layout, as from `load`"),  # type: ignore[arg-type]
+        (lambda: gridworld.make_vec("FrozenLake"), "mdp=FrozenLake: must be a compiled world"),
+        (
+            lambda: gridworld.make_vec_env("cliff", slop=1),
+            "slop: is not a setting of env=cliff; did you mean sl",
+        ),
+        (lambda: gridworld.make_vec_env("river_swim", source="deep_sea"), "source: is not a setting of"),
+        (lambda: gridworld.make_vec_env("taxi_v4", slip=0.1), "slip: is not a setting of env=taxi_v4"),
+        (lambda: gridworld.make_vec_env(slip=2), "slip=2.0: must be a probability"),
+        (lambda: gridworld.make_vec_env(layout="nowhere"), "neither a shipped layout"),
+        (lambda: gridworld.make_vec_env(observation="pixels"), "observation kind 'pixels': must be one_hot"),
+        (lambda: gridworld.make_vec_env(n_envs=0), "num_envs"),
+    ],
+)
+def test_what_is_no_world_is_refused(call: Callable[[], object], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        call()
 
 
 def by_hand(env, policy, steps):
@@ -83,13 +194,3 @@ def test_a_model_that_saw_the_environment_itself_is_scored_exactly(seen_as):
         found = gridworld.evaluate(model, place, deterministic=False).outcome
         assert (found.goal, found.expected_length) == pytest.approx(by_hand(env, policy, 30), rel=1e-5)
     assert gridworld.evaluate(policy, env).outcome.goal == pytest.approx(found.goal, rel=1e-5)
-
-
-def test_a_model_of_taxi_is_scored_within_the_step_limit_of_taxi():
-    model = DQN("MlpPolicy", "Taxi-v4", buffer_size=10, seed=0, device="cpu")
-    score = gridworld.evaluate(model)
-    assert score.regret > 1
-    assert score.outcome.timeout == pytest.approx(1)
-    assert score.outcome.expected_length == pytest.approx(200)
-    with pytest.raises(InputError, match=r"the model acts in Discrete.6.; CliffWalking-v1 has Discrete\(4\)"):
-        gridworld.evaluate(model, gym.make("CliffWalking-v1"))

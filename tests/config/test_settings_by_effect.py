@@ -4,20 +4,17 @@ import copy
 import dataclasses
 import json
 from collections import defaultdict
-from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.runs_folder import Maker
-from helpers.support import configure
 
 from gridworld.config.fields import Effect
-from gridworld.config.settings import agent_schemas, effect_of, flat, with_effects
+from gridworld.config.settings import agent_schemas, effect_of, flat
 from gridworld.config.sweep import DimensionConfig
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.report.evidence import Evidence, read
-from gridworld.report.grouping import arrange, learning_key, task_key
+from gridworld.report.evidence import Evidence
+from gridworld.report.grouping import learning_key, task_key
 from gridworld.run.provenance import identity, settings_hash
 from gridworld.training.tensorboard import hparams
 from gridworld.tune.study import _relevant
@@ -41,7 +38,14 @@ DECLARED = {
         *("recording.visits", "recording.learning", "recording.frames", "recording.gif", "recording.mp4"),
         *("recording.cell_size", "recording.fps"),
     },
-    Effect.NOTHING: {"logging.progress", "checkpoint.every", "recipe", "preset", "known_failure"},
+    Effect.NOTHING: {
+        "logging.progress",
+        "logging.wandb",
+        "checkpoint.every",
+        "recipe",
+        "preset",
+        "known_failure",
+    },
 }
 # Who goes by a setting of each effect; the task of the report's groups has a key of its own.
 EVERYBODY = {"identity", "sweep", "hparams", "group", "recipe", "search"}
@@ -144,32 +148,3 @@ def test_hashes_are_those_of_folders_that_are_there_already() -> None:
     of_another_version: dict[str, Any] = {"logging": {"surprise": 1}, "recording": {}, "checkpoint": 5}
     assert settings_hash(content | of_another_version, "S.G") == digest
     assert settings_hash(content | {"surprise": 1}, "S.G") != digest
-
-
-def test_what_a_run_is_known_by_leaves_out_what_it_may_change_on_its_way() -> None:
-    content = dataclasses.asdict(configure("agent=a2c_sb3_defaults", "env=maze"))
-    kept = frozenset(Effect) - {Effect.LENGTH, Effect.NOTHING}
-    found = with_effects(kept, content)
-    del content["checkpoint"], content["total_timesteps"], content["logging"]["progress"]
-    del content["recipe"], content["preset"], content["known_failure"], content["observation"]["features"]
-    newer = ("callbacks", "exploration_bonus", "exploring_starts", "stratified_draws")
-    assert [content.pop(key) for key in newer] == [[], 0, 0, False]  # as if there were none
-    assert found == content
-
-
-def test_runs_that_differ_in_nothing_that_is_learnt_are_one_configuration(tmp_path: Path) -> None:
-    def groups(agent: str, variants: list[dict[str, Any]]) -> list[int]:
-        maker = Maker(f"agent={agent}")
-        runs = [
-            read(maker.write(tmp_path / f"{agent}{seed}", seed, 3000, **settings))
-            for seed, settings in enumerate(variants)
-        ]
-        study = arrange(run for run in runs if isinstance(run, Evidence))
-        assert study.notes == () or agent != "dqn"
-        return sorted(len(group.runs) for group in study.groups)
-
-    kinds = (Effect.MACHINE, Effect.LABELS, Effect.FILES, Effect.NOTHING)
-    keys = {key for kind in kinds for key in DECLARED[kind] if "arguments" not in key} - {"agent.name"}
-    assert groups("dqn", [{}, *({key: 7} for key in sorted(keys))]) == [len(keys) + 1]
-    arguments: list[dict[str, Any]] = [{}, {"stats_window_size": 7}, {"n_steps": 7}]
-    assert groups("a2c_sb3_defaults", [{"agent__arguments": each} for each in arguments]) == [1, 2]

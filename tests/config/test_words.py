@@ -53,7 +53,7 @@ def test_every_way_into_a_run_takes_whole_numbers(tmp_path: Path) -> None:
         assert (type(config.total_timesteps), type(config.n_envs)) == (int, int)
     assert configure("agent=q_learning", "total_timesteps=1e5", "n_envs=8") == plain
     mine.write_text("# @package _global_\ntotal_timesteps: 1e5\n")
-    with pytest.raises(InputError, match="write a whole number without point and exponent"):
+    with pytest.raises(InputError, match="write whole numbers without a decimal point or exponent"):
         gridworld.compose("experiment=mine", f"hydra.searchpath=[file://{tmp_path}]")
     mine.write_text("agent: {policy_kwargs: {net_arch: {pi: [1e1], vf: [8.0, 4]}}}\n")
     for word in (f"recipe={mine}", "agent.policy_kwargs.net_arch={pi:[1e1],vf:[8.0,4]}"):
@@ -93,17 +93,17 @@ def test_options_have_dashes() -> None:
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("agent=dnq", "agent=dnq: there is no such choice; there are a2c, .*; did you mean dqn\\?"),
+        ("agent=dnq", "agent=dnq: no such choice; choose from a2c, .*; did you mean dqn\\?"),
         ("env=mazes", "did you mean maze\\?"),
-        ("agent.lr=1", "'agent.lr': Key 'lr' not in 'DQNConfig'; did you mean learning_rate?"),
+        ("agent.lr=1", "agent.lr: no such setting in DQNConfig; did you mean learning_rate?"),
         ("agnet=dqn", "did you mean agent\\?"),
         ("evaluation.evry=1", "did you mean every\\?"),
         ("experimnt=maze_dqn", "did you mean experiment\\?"),
-        ("learning_rate=1", "Key 'learning_rate' not in 'TrainConfig'; did you mean agent.learning_rate\\?"),
+        ("learning_rate=1", "no such setting in TrainConfig; did you mean agent.learning_rate\\?"),
         ("gama=1", "did you mean agent.gamma or evaluation.gamma\\?"),
         ("agent.slip=1", "did you mean env.slip\\?"),
-        ("agent=ppo agent.buffer_size=1", "'buffer_size' not in 'PPOConfig'; --cfg job shows all keys"),
-        ("+agent=ppo", "\\+agent=ppo: agent has a place for its choice already, .*; write agent=ppo$"),
+        ("agent=ppo agent.buffer_size=1", "no such setting in PPOConfig; --cfg job shows all keys"),
+        ("+agent=ppo", "\\+agent=ppo: agent is always chosen, .*; write agent=ppo$"),
     ],
 )
 def test_a_name_that_is_almost_right_is_suggested(words: str, told: str) -> None:

@@ -88,19 +88,17 @@ def test_where_no_offer_is_certified_the_exit_code_is_1(
     assert "None of them is certified." in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "word",
-    [
-        *("+evil=${oc.env:HOME}", "hydra.searchpath=[pkg://os]", "--config-dir=/tmp", "env/schema@env=built"),
-        *("agent.algorithm=os.system", "callbacks=[{_target_: os.system, command: ls}]"),
-    ],
-)
-def test_nothing_of_strangers_runs_in_a_trial(spoilt: Path, tmp_path: Path, word: str) -> None:
+STRANGERS = [
+    *("+evil=${oc.env:HOME}", "hydra.searchpath=[pkg://os]", "--config-dir=/tmp", "env/schema@env=built"),
+    *("agent.algorithm=os.system", "callbacks=[{_target_: os.system, command: ls}]"),
+]
+
+
+def test_nothing_of_strangers_runs_in_a_trial(spoilt: Path, tmp_path: Path) -> None:
     folder = tmp_path / "strangers"
     shutil.copytree(spoilt, folder)
-    hostile.manifest(folder, lambda content: content["overrides"].append(word))
-    saved = SavedRun(folder)
-    assert word not in saved.overrides
+    hostile.manifest(folder, lambda content: content["overrides"].extend(STRANGERS))
+    assert not set(STRANGERS) & set(SavedRun(folder).overrides)
     offers = gridworld.diagnose(folder).offers
     assert offers
     harm = ("evil", "hydra", "config-dir", "schema", "os.system")

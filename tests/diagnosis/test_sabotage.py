@@ -25,7 +25,7 @@ from gridworld.world.solver import solved
 ALL = os.environ.get("GRIDWORLD_SABOTAGES") == "all"
 _MAP, _SEED = MADE_ON[0]
 _FEW = (
-    *("dqn: network too narrow", "dqn: learning begins too late", "ppo: bonus too large"),
+    *("dqn: learning begins too late", "ppo: bonus too large"),
     *("ppo: rate too small", "ppo: rate too large", "ppo: horizon too short"),
     *("WrongSign: The advantage has the wrong sign", "QuietDQN: a sound class, target too old"),
 )
@@ -54,8 +54,6 @@ def test_the_first_cause_is_what_was_done(each: Sabotage) -> None:
     assert 1 <= len(found.commands) <= 3
     assert found.phrase in PHRASES.values()
     assert len(str(found.phrase).split()) <= 4
-    if found.cause == "network":
-        assert "its own can learn row" in found.sentence() or "cannot even tell row" in found.sentence()
 
 
 @pytest.mark.skipif(not ALL, reason="takes a quarter of an hour")
@@ -164,7 +162,6 @@ SPOILT = {  # what was done, and the offer that has to come first
     "plain gradients":
         ("dqn", "agent.policy_kwargs.optimizer_class=torch.optim.SGD", "slow", "torch.optim.Adam"),
     "rewards too small": ("dqn", "agent.reward_scale=2e-4", "scale", "reward_scale=1"),
-    "too short": ("dqn", "total_timesteps=1800", "slow budget", "total_timesteps="),
 }
 # fmt: on
 
@@ -177,6 +174,8 @@ def test_what_is_offered_first_is_certified(what: str) -> None:
         run = gridworld.train(f"agent={agent}", word, seed=8, progress=False)
     found = gridworld.diagnose(run, try_offers=True)
     assert found.cause in causes.split(), found.sentence()
+    if causes == "network":
+        assert re.search("as trained, it can learn row|cannot even distinguish row", found.sentence())
     assert offer in found.commands[0]
     assert found.tried[0].certified
     assert len(found.tried) == 1

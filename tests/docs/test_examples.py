@@ -41,8 +41,11 @@ def test_the_notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in notebook.cells)
     place = {"metadata": {"path": str(tmp_path)}}
     nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3", resources=place).execute()
-    output = str([cell.get("outputs") for cell in notebook.cells])
+    outputs = [each for cell in notebook.cells for each in cell.get("outputs", [])]
+    output, shown = str(outputs), [each["data"] for each in outputs if "data" in each]
     assert "RunResult(dqn on classic, seed 0" in output
     assert "dqn on classic: step 0 of 30,000 (0%)" in output
     assert "(100%), regret 0" in output
-    assert output.count("image/png") == 2
+    assert "6 jobs: 6 done" in output
+    assert sum("image/png" in data for data in shown) == 2  # a curve and a policy
+    assert [data["text/html"].count("<img ") for data in shown if "text/html" in data] == [2, 0]

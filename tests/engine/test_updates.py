@@ -13,7 +13,6 @@ from stable_baselines3.common.logger import Logger
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.engine import dqn, on_policy, population
-from gridworld.engine.networks import aligned
 from gridworld.engine.population import Run
 from gridworld.engine.sb3_format import algorithm_of, make_run, put_weights
 from gridworld.envs.observations import make_observation
@@ -23,9 +22,9 @@ NUM_ENVS, STEPS = 16, 32
 KINDS = ["one_hot", "coordinates", "none", "image"]
 
 
-def twins(algorithm: type, kind: str, **arguments: Any) -> tuple[Run, Any]:
+def twins(algorithm: type, kind: str, step_limit: int = 12, **arguments: Any) -> tuple[Run, Any]:
     """A run of the engine and SB3's model with the same weights and generators, in a slippery world."""
-    envs = StatisticsVectorEnv(NUM_ENVS, slip=0.2, max_episode_steps=12)
+    envs = StatisticsVectorEnv(NUM_ENVS, slip=0.2, max_episode_steps=step_limit)
     observation = make_observation(envs.mdp, kind)
     policy = "CnnPolicy" if kind == "image" else "MlpPolicy"
     models = []
@@ -138,7 +137,7 @@ def test_updates_from_rollouts(
     states, actions, advantages, returns = samples(run, n_steps * NUM_ENVS)
     log_prob, values = run.population.log_policy()
     buffer, shape = theirs.rollout_buffer, (NUM_ENVS, n_steps)  # samples are environment by environment
-    buffer.observations = run.inputs.rows(states).reshape(*shape, *buffer.obs_shape).swapaxes(0, 1)
+    buffer.observations = run.network.rows(states).reshape(*shape, *buffer.obs_shape).swapaxes(0, 1)
     buffer.actions = actions.reshape(shape).T[..., None]
     for name, table in (
         ("values", values[0, states]),
@@ -196,7 +195,7 @@ def test_updates_from_replay(
         dones, cut = rng.random((2, NUM_ENVS)) < 0.3
         ours.replay.store(*(each[None] for each in (states, actions, following, rewards, dones & ~cut)))
         infos = [{"TimeLimit.truncated": bool(each)} for each in cut]
-        rows = [run.inputs.rows(each) for each in (states, following)]
+        rows = [run.network.rows(each) for each in (states, following)]
         buffer.add(*rows, actions, rewards, dones, infos)
     with torch.no_grad():  # a target network of its own
         ours.target.weights += 0.1 * torch.randn_like(ours.target.weights)
@@ -227,6 +226,50 @@ def test_the_same_seed_walks_and_learns_the_same(algorithm: Any) -> None:
         assert torch.allclose(mine, peer, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("algorithm", [PPO, A2C, DQN, QRDQN])
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size of")
+def test_only_the_states_within_the_step_limit_learn(algorithm: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a large world, what is never met keeps its weights, and the others learn as if all could."""
+    for module in (population, dqn, on_policy):
+        monkeypatch.setattr(module, "FEW_STATES", 0)
+    off_policy = algorithm in (DQN, QRDQN)
+    settings = {"learning_starts": 0, "buffer_size": 800, "train_freq": 2} if off_policy else {"n_steps": 8}
+    settings |= {"batch_size": 16} if algorithm is not A2C else {}
+
+    def learner(steps: int, state: Any = None) -> Run:
+        run, _ = twins(algorithm, "one_hot", step_limit=3, **settings)
+        run.total_timesteps = steps
+        population.train([run], [state])
+        assert run.error is None
+        put_weights(run)
+        return run
+
+    def weights(run: Run) -> list[Any]:
+        optimizer = run.model.policy.optimizer.state_dict()["state"]
+        moments = [each for state in optimizer.values() for each in state.values()]
+        return [each.detach().clone() for each in (*run.model.policy.parameters(), *moments)]
+
+    made, half, whole = learner(0), learner(256), learner(512)
+    met = population.met_states(whole)
+    assert met is not None
+    assert 0 < len(met) < 30 / 2
+    nets: Any = whole.population.networks
+    assert nets.weights.shape[1] < nets.whole().shape[1]
+    unmet = np.delete(np.arange(30), met)
+    firsts = [(net[0].weight, before[0].weight) for net, before in zip(whole.nets, made.nets, strict=True)]
+    for first, before in firsts:
+        assert torch.equal(first[:, unmet], before[:, unmet])
+        assert not torch.equal(first[:, met], before[:, met])
+    resumed = learner(512, half.population.get_state(half))
+    assert all(map(torch.equal, weights(resumed), weights(whole)))
+    _, probabilities, q = whole.population.snapshot(whole)  # of all states
+    assert np.abs((q if off_policy else probabilities)[unmet]).all()  # type: ignore[index]
+    monkeypatch.setattr(population, "met_states", lambda run: None)
+    monkeypatch.setattr(dqn, "met_states", lambda run: None)
+    for mine, peer in zip(weights(whole), weights(learner(512)), strict=True):
+        assert torch.allclose(mine, peer, rtol=1e-3, atol=1e-4)
+
+
 @pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO])
 def test_rollouts_and_advantages_are_sb3s(algorithm: Any) -> None:
     """SB3's own recursion over the rewards, values and ends of a rollout, and its values at time-outs."""
@@ -248,42 +291,10 @@ def test_rollouts_and_advantages_are_sb3s(algorithm: Any) -> None:
     ends = (rollout.terminated | rollout.truncated)[:, 0]
     assert ends.sum() > rollout.truncated.sum() > 0
     buffer.values = values[0][states]
-    cut = rollout.truncated[:, 0] * theirs.gamma * values[0][rollout.last_states[:, 0]]
+    cut = rollout.truncated[:, 0] * theirs.gamma * values[0][rollout.reached[:, 0]]
     buffer.rewards = (rollout.rewards[:, 0] + cut).astype(np.float32)
     buffer.episode_starts = np.concatenate([np.ones((1, NUM_ENVS)), ends[:-1]]).astype(np.float32)
     last = torch.as_tensor(values[0][rollout.final_states[0]])
     buffer.compute_returns_and_advantage(last, ends[-1])
     for name, table in (("advantages", advantages), ("returns", returns)):
         assert np.allclose(getattr(buffer, name).T.ravel(), table[0], rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("states", [None, np.array([3, 7, 8])], ids=["all states", "some states"])
-@pytest.mark.parametrize(
-    ("kind", "arguments"),
-    [
-        *[("one_hot", RELU), ("one_hot", ELU), ("one_hot", LINEAR)],
-        *[("coordinates", TWO_SIZES), ("image", {})],
-    ],
-    ids=str,
-)
-def test_products_with_the_jacobian_agree_from_both_sides(
-    kind: str, arguments: dict[str, Any], states: Any
-) -> None:
-    """uᵀ(J v) = (uᵀJ) v, and J v is what small changes v of the weights do."""
-    run, _ = twins(TRPO, kind, batch_size=64, n_steps=4, **arguments)
-    for networks in run.population.all_networks:
-        (outputs,) = (each.copy() for each in networks.run(states))
-        change = torch.randn(networks.weights.shape, generator=torch.Generator().manual_seed(1))
-        slopes = np.random.default_rng(1).normal(size=outputs.shape).astype(np.float32)
-        (moved,) = networks.push(aligned(change))
-        networks.backward(slopes)
-        scale = float(np.abs(slopes * moved).sum())
-        assert float((networks.gradients * change).sum()) == pytest.approx(
-            (slopes * moved).sum(), abs=1e-5 * scale
-        )
-        weights, length = networks.weights.clone(), 1e-5  # little: ReLU has kinks
-        networks.weights.copy_(weights + length * change)
-        (ahead,) = (each.copy() for each in networks.run(states))
-        networks.weights.copy_(weights - length * change)
-        (behind,) = networks.run(states)
-        assert np.allclose((ahead - behind) / (2 * length), moved, atol=0.02 * np.abs(moved).max())

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from gymnasium.wrappers.vector import TransformObservation
 from helpers.support import configure
+from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
 import gridworld
 from gridworld import GridWorldEnv, InputError
-from gridworld.agents import family
 from gridworld.envs.inspection import observation_like
 from gridworld.envs.observations import KINDS, TableObservation, make_observation
 from gridworld.training.setup import make_context
@@ -31,45 +31,30 @@ WRAPPERS = {  # kind: (wrapper of one environment, wrapper of a batch)
 }
 
 
-@pytest.fixture(params=[0.0, 0.2], ids=["", "slip"])
-def slip(request):
-    return request.param
-
-
 @pytest.mark.parametrize("kind", WRAPPERS)
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_one_env(layout, kind, slip):
-    from stable_baselines3.common.env_checker import check_env as check_for_sb3
-
-    env = WRAPPERS[kind][0](gym.make("GridWorld-v0", layout=layout, slip=slip))
+def test_an_observation_is_the_row_of_its_state(layout, kind):
+    one, batch = WRAPPERS[kind]
+    env = one(gym.make("GridWorld-v0", layout=layout, slip=0.2))
+    envs = batch(gym.make_vec("GridWorld-v0", num_envs=3, layout=layout, slip=0.2))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_for_sb3(env)
     table = make_observation(env.unwrapped.mdp, kind).table()
     assert len(table) == env.unwrapped.mdp.num_states
-    observation, _ = env.reset(seed=1)
-    for action in np.random.default_rng(1).integers(4, size=60):
-        row = table[env.unwrapped.state]
-        assert observation in env.observation_space
-        assert np.array_equal(observation, row)
-        assert np.asarray(observation).dtype == table.dtype == env.observation_space.dtype
-        observation, _, terminated, truncated, _ = env.step(action)
-        if terminated or truncated:
-            observation, _ = env.reset()
-
-
-@pytest.mark.parametrize("kind", WRAPPERS)
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_batch_of_envs(layout, kind, slip):
-    envs = WRAPPERS[kind][1](gym.make_vec("GridWorld-v0", num_envs=3, layout=layout, slip=slip))
-    table = make_observation(envs.unwrapped.mdp, kind).table()
     assert envs.observation_space.shape == (3, *envs.single_observation_space.shape)
-    observations, _ = envs.reset(seed=1)
+    observation, observations = env.reset(seed=1)[0], envs.reset(seed=1)[0]
     for actions in np.random.default_rng(1).integers(4, size=(60, 3)):
+        assert observation in env.observation_space
+        assert np.array_equal(observation, table[env.unwrapped.state])
         assert observations in envs.observation_space
         assert np.array_equal(observations, table[envs.unwrapped.states])
-        assert observations.dtype == table.dtype == envs.single_observation_space.dtype
         assert all(row in envs.single_observation_space for row in observations)
+        dtypes = {np.asarray(observation).dtype, observations.dtype, table.dtype}
+        assert dtypes == {env.observation_space.dtype, envs.single_observation_space.dtype}
+        observation, _, terminated, truncated, _ = env.step(actions[0])
+        if terminated or truncated:
+            observation, _ = env.reset()
         observations, *_ = envs.step(actions)
 
 
@@ -204,7 +189,7 @@ def test_the_environments_own_observation():
 
 @pytest.mark.parametrize(
     ("kind", "why"),
-    [("own", "no observation of its own"), ("coordinates", "no places"), ("image", "no places")],
+    [("own", "no observation of its own"), ("coordinates", "no coordinates"), ("image", "no coordinates")],
 )
 def test_a_world_without_what_an_observation_shows(kind, why):
     with pytest.raises(InputError, match=f"^observation {kind}: .*row ha(s|ve) {why}") as refused:
@@ -215,19 +200,18 @@ def test_a_world_without_what_an_observation_shows(kind, why):
         observation_like(world(), gym.spaces.Box(0, 1, (2,), np.float32))
 
 
-@pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
-@pytest.mark.parametrize("numbers", [False, True])
-def test_agents_train_on_the_environments_own_observation(algorithm, numbers):
+@pytest.mark.parametrize(
+    ("agent", "small"),
+    [("ppo", {"n_steps": 16, "n_epochs": 1}), ("dqn", {"learning_starts": 20, "buffer_size": 100})],
+)
+@pytest.mark.parametrize("engine", ["stock", "tabulated"])
+def test_agents_train_on_the_environments_own_observation(agent, small, engine):
     images = np.repeat(np.arange(4, dtype=np.uint8), 7 * 7 * 3).reshape(4, 7, 7, 3)
-    mdp = world(own_observation=np.arange(4) if numbers else images)
-    small = (
-        {"n_steps": 16, "n_epochs": 1} if algorithm == "PPO" else {"learning_starts": 20, "buffer_size": 100}
-    )
-    for engine in ("stock", "tabulated"):
-        config = configure(f"agent={algorithm.lower()}", "observation=own", f"agent.engine={engine}")
+    for own in (np.arange(4), images):
+        mdp = world(own_observation=own)
+        config = configure(f"agent={agent}", "observation=own", f"agent.engine={engine}")
         settings = dataclasses.replace(config.agent, **small)
-        context = make_context(config, mdp, make_observation(mdp, "own"))
-        agent = family(settings).build(settings, context)
-        agent.learn(128, lambda steps: steps + 1)
-        assert agent.model.num_timesteps >= 128
-        assert agent.snapshot().greedy.shape == (mdp.num_states,)
+        trained = settings.build(make_context(config, mdp))
+        trained.learn(128, lambda steps: steps + 1)
+        assert trained.model.num_timesteps >= 128
+        assert trained.snapshot().greedy.shape == (mdp.num_states,)

@@ -64,45 +64,39 @@ def test_every_pixel_of_the_default_world(state, size):
     assert np.array_equal(shown, np.unique([WHITE, BLACK, TRAP, GOAL, AGENT] @ places))
 
 
-def test_walls_fill_their_cells_in_a_colour_of_their_own():
+def test_walls_and_cliffs_fill_their_cells_in_colours_of_their_own():
     frame = frame_of(TRICKY, 0)
     [wall] = np.unique(frame[101:200, 301:400].reshape(-1, 3), axis=0)
-    assert tuple(wall) not in {WHITE, BLACK, TRAP, GOAL, AGENT}
     assert (frame[301:400, 101:200] == wall).all()
     colours, certain = expected(World(TRICKY), 0, 100)
     certain &= (frame != wall).any(axis=2)
     assert np.array_equal(frame[certain], colours[certain])
-
-
-def test_cliffs_fill_their_cells_in_another_colour():
-    rows = ("S...", ".#C.", "C..G")
-    frame = frame_of(rows, 0)
-    [wall], [cliff] = (
-        np.unique(frame[201:300, left : left + 99].reshape(-1, 3), axis=0).tolist() for left in (201, 301)
-    )
-    assert tuple(cliff) not in {WHITE, BLACK, TRAP, GOAL, AGENT, tuple(wall)}
+    frame = frame_of(("S...", ".#C.", "C..G"), 0)
+    [same], [cliff] = (np.unique(frame[201:300, x : x + 99].reshape(-1, 3), axis=0) for x in (201, 301))
+    assert tuple(same) == tuple(wall)
+    assert len({WHITE, BLACK, TRAP, GOAL, AGENT, tuple(wall), tuple(cliff)}) == 7
     assert (frame[301:400, 101:200] == cliff).all()
-    env = GridWorldEnv(render_mode="ansi", layout=parse("\n".join(rows), "map"))
-    env.reset()
-    assert env.render().splitlines() == ["A...", ".#C.", "C..G"]
 
 
-def test_every_frame_is_a_fresh_array():
+def test_a_frame_is_a_fresh_array_and_without_a_mode_there_is_none():
     env = GridWorldEnv(render_mode="rgb_array")
     env.reset()
     first, second = env.render(), env.render()
-    assert not np.shares_memory(first, second)
     first[:] = 0
     assert np.array_equal(second, env.render())
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert GridWorldEnv().render() is None
 
 
-def test_the_map_as_text():
-    env = GridWorldEnv(render_mode="ansi", layout=parse("\n".join(TRICKY), "map"))
+@pytest.mark.parametrize(
+    ("rows", "state", "shown"),
+    [(TRICKY, 9, "S.#T .GT. #A.S"), (TRICKY, 5, "S.#T .AT. #..S"), (("S.#", "C.G"), 0, "A.# C.G")],
+)
+def test_the_map_as_text(rows, state, shown):
+    env = GridWorldEnv(render_mode="ansi", layout=parse("\n".join(rows), "map"))
     env.reset()
-    env.state = 9
-    assert env.render().splitlines() == ["S.#T", ".GT.", "#A.S"]
-    env.state = 5
-    assert env.render().splitlines() == ["S.#T", ".AT.", "#..S"]
+    env.state = state
+    assert env.render().split() == shown.split()
 
 
 def test_a_frame_that_would_be_too_large_is_refused():
@@ -112,11 +106,6 @@ def test_a_frame_that_would_be_too_large_is_refused():
             GridWorldEnv(render_mode=mode, layout=layout).render()
     small = GridWorldEnv(render_mode="rgb_array", layout=layout, cell_size=10)
     assert small.render().shape == (1020, 1020, 3)
-
-
-def test_without_a_render_mode_nothing_is_drawn():
-    with pytest.warns(UserWarning, match="render_mode"):
-        assert GridWorldEnv().render() is None
 
 
 def python(code, **environment):

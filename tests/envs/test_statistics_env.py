@@ -41,12 +41,10 @@ def test_visits_and_returns_are_those_of_a_naive_tally(settings: dict, dtype: ty
                 ended.append(under_way[index])
                 over.append((index, under_way[index], length[index]))
                 under_way[index], length[index] = 0.0, 0
-        *step, told = counted.advance(chosen)
-        assert np.array_equal(step[0], states)  # counting changes nothing
-        assert np.allclose(step[1], paid, rtol=1e-12, atol=0)  # but the bonus, which is in no return
-        assert over == (
-            [] if told is None else list(zip(told.which, told.returns, told.lengths, strict=True))
-        )
+        step = counted.advance(chosen)
+        assert np.array_equal(step.states, states)  # counting changes nothing
+        assert np.allclose(step.rewards, paid, rtol=1e-12, atol=0)  # but the bonus, which is in no return
+        assert over == list(zip(step.which, step.returns, step.lengths, strict=True))
     assert len(ended) > 20
     assert np.array_equal(counted.visits, visits)
     assert counted.take_returns().mean == pytest.approx(np.mean(ended))

@@ -3,13 +3,10 @@
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gridworld import GridWorldEnv
-from gridworld.engine.environments import Environments
-from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv, stratified_numbers
 from gridworld.world.mdp import FloatArray, IntArray
 
@@ -52,26 +49,3 @@ def test_the_starts_are_spread_over_the_states() -> None:
     envs = GridWorldVectorEnv(len(mdp.start_states) * 7, mdp=mdp, stratified=True)
     states, _ = envs.reset(seed=0)
     assert (np.bincount(states)[mdp.start_states] == 7).all()
-
-
-@pytest.mark.parametrize("num_envs", [1, 3, 40])
-def test_rollouts_of_several_batches_draw_what_each_would_alone(num_envs: int) -> None:
-    mdp = GridWorldEnv(slip=0.3).mdp.with_exploring_starts(0.5)
-
-    def batches() -> list[StatisticsVectorEnv]:
-        made = [
-            StatisticsVectorEnv(num_envs, mdp=mdp, stratified=True, max_episode_steps=20) for _ in range(3)
-        ]
-        for seed, each in enumerate(made):
-            each.reset(seed=seed)
-        return made
-
-    draws = np.random.default_rng(2).random((60, 3, num_envs), dtype=np.float32)
-    uniform = np.full((3, mdp.num_states, 4), 0.25)
-    rolled = Environments(batches()).roll(uniform, draws.reshape(60, -1))
-    for run, batch in enumerate(batches()):
-        for step in range(60):
-            assert np.array_equal(batch.states, rolled.pairs[step, run] // 4)
-            found = batch.advance(np.floor(draws[step, run] * 4).astype(np.int64))
-            assert np.array_equal(found[1], rolled.rewards[step, run])
-        assert np.array_equal(batch.states, rolled.final_states[run])

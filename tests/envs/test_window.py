@@ -24,28 +24,20 @@ def window_env():
     env.close()
 
 
-def test_one_window_is_opened_and_reused(window_env):
+def test_one_window_is_opened_and_draws_what_rgb_array_draws(window_env):
+    picture = GridWorldEnv(render_mode="rgb_array")
     assert window_env.window is None
     window_env.reset()
     window, clock = window_env.window, window_env.clock
     assert window is pygame.display.get_surface()
     assert window.get_size() == (800, 700)
     assert clock is not None
-    for action in SHORTEST:
-        window_env.step(action)
-    assert window_env.render() is None
-    assert window_env.window is window
-    assert window_env.clock is clock
-
-
-def test_human_mode_draws_what_rgb_array_draws(window_env):
-    picture = GridWorldEnv(render_mode="rgb_array")
-    window_env.reset()
     for action in (None, *SHORTEST):
         if action is not None:
             picture.state, *_ = window_env.step(action)
-        shown = pygame.surfarray.array3d(window_env.window).swapaxes(0, 1)
-        assert np.array_equal(shown, picture.render())
+        assert np.array_equal(pygame.surfarray.array3d(window).swapaxes(0, 1), picture.render())
+    assert window_env.render() is None
+    assert (window_env.window, window_env.clock) == (window, clock)
 
 
 def test_human_mode_keeps_its_pace():

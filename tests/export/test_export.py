@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from helpers.pages import blocks
-from helpers.support import SHORT, script, train_in
+from helpers.support import NO_FILES, SHORT, script, train_in
 from PIL import Image
 
 from gridworld.commands import export
@@ -104,6 +104,30 @@ def test_wandb(place: Path) -> None:
     assert [entry.path for entry in artifact.manifest.contents] == ["best_model.zip", "model.zip"]
 
 
+def test_wandb_while_it_trains(tmp_path: Path) -> None:
+    """Two runs that train together, and an agent of SB3's own loop with W&B's callback."""
+    callback = "callbacks=[{_target_: wandb.integration.sb3.WandbCallback, verbose: 0}]"
+    words = [*SHORT["ppo"], *NO_FILES, "logging.wandb=true"]
+    for more in (
+        ["-m", "seed=0,1", "hydra.sweep.dir=runs"],
+        ["seed=2", callback, "hydra.run.dir=runs/alone"],
+    ):
+        done = script("train.py", *more, *words, cwd=tmp_path, HOME=str(tmp_path), WANDB_MODE="offline")
+        assert done.returncode == 0, done.stderr
+    found = {}
+    for file in tmp_path.glob("wandb/offline-run-*/*.wandb"):
+        records = list(wandb_records(file))
+        rows = [values_of(each.history.item) for each in records if each.HasField("history")]
+        [run] = [each.run for each in records if each.HasField("run")]
+        found[run.display_name] = {row["step"]: row["eval/regret"] for row in rows if "eval/regret" in row}
+        assert any("train/loss" in row for row in rows)
+    assert len(found) == 3
+    for seed, folder in enumerate(("seed=0", "seed=1", "alone")):
+        with (tmp_path / "runs" / folder / "curve.csv").open() as file:
+            regrets = {int(row["step"]): float(row["regret"]) for row in csv.DictReader(file)}
+        assert found[f"ppo-classic-seed{seed}"] == regrets
+
+
 def values_of(items: Any) -> dict[str, Any]:
     return {".".join(item.nested_key) or item.key: json.loads(item.value_json) for item in items}
 
@@ -166,7 +190,7 @@ def test_mlflow(place: Path) -> None:
     uri = f"sqlite:///{place}/store/mlflow.db"
     assert told == [
         *(f"runs/dqn: {uri}", f"runs/table: {uri}"),
-        f"next: mlflow ui --backend-store-uri {uri}",
+        f"next: pip install mlflow && mlflow ui --backend-store-uri {uri}",
     ]
     names, status, params, metrics, regret, files, model = found
     assert (names, status) == ([NAME, TABLE], "FINISHED")

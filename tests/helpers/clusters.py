@@ -11,15 +11,13 @@ import shutil
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
-from helpers import forks
+from helpers.support import wait_for
 
-_STARTED_WITHIN = 180.0  # seconds
 _DAEMONS = ("munged", "slurmctld", "slurmd")
 _CONFIGURATION = """
 ClusterName=test
@@ -98,7 +96,7 @@ def slurm(folder: Path, variables: dict[str, str]) -> Iterator[dict[str, str]]:
 def ray_head(folder: Path, variables: dict[str, str]) -> Iterator[dict[str, str]]:
     """The variables of the environment by which a program finds it. Its workers get `variables`."""
     if importlib.util.find_spec("ray") is None and not os.environ.get("GRIDWORLD_REQUIRE_RAY"):
-        pytest.skip("no Ray to test with: pip install 'gridworld-sb3[ray]'")
+        pytest.skip("no Ray to test with: pip install -e '.[ray]'")
     port, *_ = _free_ports(1)
     token = folder / "token"  # its own, whatever the user has in the home folder
     token.write_text(secrets.token_hex(32))
@@ -137,19 +135,6 @@ def _daemon(
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-
-
-def wait_for(
-    condition: Callable[[], object],
-    what: str,
-    process: subprocess.Popen[bytes] | forks.Started | None = None,
-) -> None:
-    """Until it holds. Fails after a while."""
-    end = time.monotonic() + _STARTED_WITHIN
-    while not condition():
-        assert time.monotonic() < end, f"waited for {what}"
-        assert process is None or process.poll() is None, f"{what} ended"
-        time.sleep(0.1)
 
 
 def _free_ports(count: int) -> list[int]:

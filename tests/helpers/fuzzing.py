@@ -14,15 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from helpers.forks import megabytes
-from helpers.hostile import seal
+from helpers.hostile import damaged, seal
 from helpers.support import SHORT, configure
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.agents import family
 from gridworld.commands import jobs as jobs_command
 from gridworld.config.compose import to_config
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.report.evidence import read
 from gridworld.report.setting_charts import tuning_charts
@@ -87,9 +85,8 @@ def fuzz_config(random: random.Random, folder: Path) -> None:
     merged = OmegaConf.merge(settings, OmegaConf.create(content))
     config = to_config(merged)  # type: ignore[arg-type]
     mdp = check_settings(config)
-    observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
     Evaluator(mdp, config.evaluation.gamma, config.env.max_episode_steps)
-    family(config.agent).build(config.agent, make_context(config, mdp, observation))
+    config.agent.build(make_context(config, mdp))
 
 
 def spoil(random: random.Random, content: dict[Any, Any]) -> None:
@@ -202,27 +199,6 @@ def fresh_copy(random: random.Random, folder: Path) -> Path:
     for name in ("manifest.json", "summary.json", "curve.csv", "model.zip", "visits.npy"):
         shutil.copy(good / name, run / name)
     return run
-
-
-def damaged(random: random.Random, raw: bytes) -> bytes:
-    """Some bytes changed, cut off, put in or doubled."""
-    content = bytearray(raw)
-    for _ in range(random.choice([1, 1, 1, 2, 8])):
-        place = random.randrange(len(content))
-        match random.choice(["flip", "flip", "flip", "set", "cut", "put", "double"]):
-            case "flip":
-                content[place] ^= 1 << random.randrange(8)
-            case "set":
-                extremes = [b"\xff\xff\xff\xff", b"\0\0\0\0", b"\x7f\xff\xff\xff"]
-                content[place : place + 4] = random.choice(extremes)
-            case "cut":
-                del content[place : place + random.choice([1, 100, len(content)])]
-                content += b"" if content else b"x"
-            case "put":
-                content[place:place] = random.randbytes(random.choice([1, 50]))
-            case "double":
-                content[place:place] = content[place : place + 200]
-    return bytes(content)
 
 
 TARGETS: dict[str, Target] = {

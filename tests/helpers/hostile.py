@@ -10,15 +10,16 @@ stranger's manifest are the stranger's. `base`, in texts `{base}`, holds the fol
 """
 
 import base64
+import functools
 import hashlib
 import io
 import json
 import os
 import pickle
+import random
 import shutil
 import struct
 import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,17 +89,45 @@ def weights(run: Path, edit: Callable[[dict[str, torch.Tensor]], object]) -> Non
     members("model.zip", {"policy.pth": buffer.getvalue()})(run, run)
 
 
+def damaged(chance: random.Random, raw: bytes) -> bytes:
+    """Some bytes changed, cut off, put in or doubled."""
+    content = bytearray(raw)
+    for _ in range(chance.choice([1, 1, 1, 2, 8])):
+        place = chance.randrange(len(content))
+        match chance.choice(["flip", "flip", "flip", "set", "cut", "put", "double"]):
+            case "flip":
+                content[place] ^= 1 << chance.randrange(8)
+            case "set":
+                extremes = [b"\xff\xff\xff\xff", b"\0\0\0\0", b"\x7f\xff\xff\xff"]
+                content[place : place + 4] = chance.choice(extremes)
+            case "cut":
+                del content[place : place + chance.choice([1, 100, len(content)])]
+                content += b"" if content else b"x"
+            case "put":
+                content[place:place] = chance.randbytes(chance.choice([1, 50]))
+            case "double":
+                content[place:place] = content[place : place + 200]
+    return bytes(content)
+
+
 # ---- kinds of damage ---------------------------------------------------------------------------------------
 
 
-def members(file: str, changes: dict[str, Content], kind: int = zipfile.ZIP_STORED) -> Spoil:
+def spoiling(act: Callable[..., object]) -> Callable[..., Spoil]:
+    """The function, given all but the run and the base, is what does it to a run."""
+    return lambda *given, **named: lambda run, base: act(run, base, *given, **named)
+
+
+@spoiling
+def members(
+    run: Path, base: Path, file: str, changes: dict[str, Content], kind: int = zipfile.ZIP_STORED
+) -> None:
     """Replace members of a zip file, or put them in."""
-
-    def spoil(run: Path, base: Path) -> None:
-        changed = {name: _bytes(content, base) for name, content in changes.items()}
-        seal(run, file, zipped(_members(run / file) | changed, kind))
-
-    return spoil
+    seal(
+        run,
+        file,
+        zipped(_members(run / file) | {name: _bytes(changes[name], base) for name in changes}, kind),
+    )
 
 
 def _members(path: Path) -> dict[str, bytes]:
@@ -119,77 +148,59 @@ def zipped(members: dict[str, bytes], kind: int = zipfile.ZIP_STORED) -> bytes:
     return buffer.getvalue()
 
 
-def file(name: str, content: Content) -> Spoil:
+@spoiling
+def file(run: Path, base: Path, name: str, content: Content) -> None:
     """Write a file, and its checksum."""
-    return lambda run, base: seal(run, name, _bytes(content, base))
+    seal(run, name, _bytes(content, base))
 
 
-def packed(name: str, member: str, size: int) -> Spoil:
-    """A zip file of zeros, which takes no room, and its checksum where it has one."""
-
-    def spoil(run: Path, base: Path) -> None:
-        content = zipped({"state.json": b"{}", member: bytes(size)}, zipfile.ZIP_DEFLATED)
-        (run / name).write_bytes(content)
-        if name != LAST:
-            seal(run, name)
-
-    return spoil
+@spoiling
+def packed(run: Path, base: Path, name: str, member: str, size: int) -> None:
+    """A zip file of zeros, which takes no room."""
+    seal(run, name, zipped({member: bytes(size)}, zipfile.ZIP_DEFLATED))
 
 
-def linked(name: str, target: str) -> Spoil:
+@spoiling
+def linked(run: Path, base: Path, name: str, target: str) -> None:
     """A symbolic link in the place of whatever is there."""
-
-    def spoil(run: Path, base: Path) -> None:
-        path = run / name
-        path.parent.mkdir(exist_ok=True)
-        if path.is_dir() and not path.is_symlink():
-            path.rename(path.with_name(f"{path.name}-before"))
-        path.unlink(missing_ok=True)
-        path.symlink_to(target.format(base=base))
-
-    return spoil
+    path = run / name
+    path.parent.mkdir(exist_ok=True)
+    if path.is_dir() and not path.is_symlink():
+        path.rename(path.with_name(f"{path.name}-before"))
+    path.unlink(missing_ok=True)
+    path.symlink_to(target.format(base=base))
 
 
-def waiting(name: str) -> Spoil:
+@spoiling
+def waiting(run: Path, base: Path, name: str) -> None:
     """A pipe: whoever opens it waits for a writer."""
-
-    def spoil(run: Path, base: Path) -> None:
-        (run / name).unlink(missing_ok=True)
-        os.mkfifo(run / name)
-
-    return spoil
+    (run / name).unlink(missing_ok=True)
+    os.mkfifo(run / name)
 
 
-def grown(name: str, size: int) -> Spoil:
+@spoiling
+def grown(run: Path, base: Path, name: str, size: int) -> None:
     """A file that claims to be large and takes no room."""
-
-    def spoil(run: Path, base: Path) -> None:
-        (run / name).write_bytes(b"")
-        os.truncate(run / name, size)
-
-    return spoil
+    (run / name).write_bytes(b"")
+    os.truncate(run / name, size)
 
 
-def said(**values: Any) -> Spoil:
+@spoiling
+def said(run: Path, base: Path, **values: Any) -> None:
     """Entries of the manifest."""
-    return lambda run, base: manifest(run, lambda content: content.update(_placed(values, base)))
+    manifest(run, lambda content: content.update(_placed(values, base)))
 
 
-def settings(changes: dict[str, Any]) -> Spoil:
+@spoiling
+def settings(run: Path, base: Path, changes: dict[str, Any]) -> None:
     """Settings in the manifest, by dotted names."""
 
-    def spoil(run: Path, base: Path) -> None:
-        def edit(content: dict[str, Any]) -> None:
-            for name, value in _placed(changes, base).items():
-                *path, last = name.split(".")
-                section = content["config"]
-                for part in path:
-                    section = section[part]
-                section[last] = value
+    def edit(content: dict[str, Any]) -> None:
+        for name, value in _placed(changes, base).items():
+            *path, last = name.split(".")
+            functools.reduce(dict.__getitem__, path, content["config"])[last] = value
 
-        manifest(run, edit)
-
-    return spoil
+    manifest(run, edit)
 
 
 def _placed(value: Any, base: Path) -> Any:
@@ -199,29 +210,23 @@ def _placed(value: Any, base: Path) -> Any:
     return value.replace("{base}", str(base)) if isinstance(value, str) else value
 
 
-def world(**values: Any) -> Spoil:
+@spoiling
+def world(run: Path, base: Path, **values: Any) -> None:
     """Settings of the world, so that resume goes on with them and draws the episode."""
-
-    def spoil(run: Path, base: Path) -> None:
-        changes = {f"env.{name}": value for name, value in values.items()}
-        settings({**changes, "recording.gif": True})(run, base)
-        content = json.loads((run / "manifest.json").read_text())
-        own = identity(read_config(content["config"], ""), "\n".join(content["layout"]))
-        checkpoint(lambda state: state.update(identity=own))(run, base)
-
-    return spoil
+    changes = {f"env.{name}": value for name, value in values.items()}
+    settings({**changes, "recording.gif": True})(run, base)
+    content = json.loads((run / "manifest.json").read_text())
+    own = identity(read_config(content["config"], ""), "\n".join(content["layout"]))
+    checkpoint(lambda state: state.update(identity=own))(run, base)
 
 
-def checkpoint(edit: Callable[[dict[str, Any]], object]) -> Spoil:
+@spoiling
+def checkpoint(run: Path, base: Path, edit: Callable[[dict[str, Any]], object]) -> None:
     """Change the newest checkpoint, whose checksum is right again."""
-
-    def spoil(run: Path, base: Path) -> None:
-        path = max((run / "checkpoints").glob("*.state"))
-        state = decode(path.read_bytes())
-        edit(state)
-        path.write_bytes(encode(state))
-
-    return spoil
+    path = max((run / "checkpoints").glob("*.state"))
+    state = decode(path.read_bytes())
+    edit(state)
+    path.write_bytes(encode(state))
 
 
 def mark_of_nothing(part: str, name: str) -> Spoil:
@@ -230,57 +235,40 @@ def mark_of_nothing(part: str, name: str) -> Spoil:
     return checkpoint(lambda state: state["marks"].update({part: mark}))
 
 
-def newest_checkpoint(text: Content, arrays: dict[str, bytes] | None = None) -> Spoil:
+@spoiling
+def newest_checkpoint(run: Path, base: Path, text: Content, arrays: dict[str, bytes] | None = None) -> None:
     """One of this JSON and these files of arrays, whose checksums are right."""
-
-    def spoil(run: Path, base: Path) -> None:
-        (run / LAST).write_bytes(zipped({"state.json": _bytes(text, base), **(arrays or {})}))
-
-    return spoil
+    (run / LAST).write_bytes(zipped({"state.json": _bytes(text, base), **(arrays or {})}))
 
 
-def tensor(edit: Callable[[torch.Tensor], torch.Tensor | None]) -> Spoil:
-    """Another tensor in the place of the first weights; None leaves them out."""
-
-    def changed(content: dict[str, torch.Tensor]) -> None:
-        name = "q_net.q_net.0.weight"
-        new = edit(content.pop(name))
-        if new is not None:
-            content[name] = new
-
-    return lambda run, base: weights(run, changed)
+@spoiling
+def tensor(run: Path, base: Path, edit: Callable[[torch.Tensor], torch.Tensor]) -> None:
+    """Another tensor in the place of the first weights."""
+    name = "q_net.q_net.0.weight"
+    weights(run, lambda content: content.update({name: edit(content[name])}))
 
 
-def array(name: str, edit: Callable[[Any], Any]) -> Spoil:
+@spoiling
+def array(run: Path, base: Path, name: str, edit: Callable[[Any], Any]) -> None:
     """Change an array of the world's file, whose checksum is right again."""
-
-    def spoil(run: Path, base: Path) -> None:
-        with np.load(run / "world.npz") as there:
-            content = dict(there)
-        seal(run, "world.npz", npz_bytes(content | {name: edit(content[name])}))
-
-    return spoil
+    with np.load(run / "world.npz") as there:
+        content = dict(there)
+    seal(run, "world.npz", npz_bytes(content | {name: edit(content[name])}))
 
 
-def unsealed(name: str, spoil: Spoil) -> Spoil:
+@spoiling
+def unsealed(run: Path, base: Path, name: str, spoil: Spoil) -> None:
     """Damage to a file whose checksum stays as it was."""
-
-    def spoil_alone(run: Path, base: Path) -> None:
-        before = json.loads((run / "manifest.json").read_text())["sha256"][name]
-        spoil(run, base)
-        manifest(run, lambda told: told["sha256"].update({name: before}))
-
-    return spoil_alone
+    before = json.loads((run / "manifest.json").read_text())["sha256"][name]
+    spoil(run, base)
+    manifest(run, lambda told: told["sha256"].update({name: before}))
 
 
-def all_of(*spoils: Spoil) -> Spoil:
+@spoiling
+def all_of(run: Path, base: Path, *spoils: Spoil) -> None:
     """One after the other."""
-
-    def spoil(run: Path, base: Path) -> None:
-        for each in spoils:
-            each(run, base)
-
-    return spoil
+    for each in spoils:
+        each(run, base)
 
 
 # ---- contents of files -------------------------------------------------------------------------------------
@@ -322,48 +310,16 @@ def pickled_array(base: Path) -> bytes:
     return buffer.getvalue()
 
 
-def shared_members(base: Path) -> bytes:
-    """A zip file of 500 members that are the same bytes."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        archive.writestr("a.pth", bytes(2**20))
-        first = archive.infolist()[0]
-        for index in range(500):
-            again = zipfile.ZipInfo(f"{index}.pth")
-            again.header_offset, again.CRC = first.header_offset, first.CRC
-            again.file_size = again.compress_size = first.file_size
-            archive.filelist.append(again)
-    return buffer.getvalue()
+def event(content: bytes, length: int | None = None) -> bytes:
+    """A record of an event file, which may claim to be longer."""
+    head = struct.pack("<Q", len(content) if length is None else length)
+    return b"".join([head, _checksum(head), content, _checksum(content)])
 
 
-def png(side: int) -> bytes:
-    """A white square whose pixels are much larger than its file."""
-    packer = zlib.compressobj(9)
-    rows = b"".join(packer.compress(bytes(1 + 3 * side)) for _ in range(side)) + packer.flush()
-    size = side.to_bytes(4, "big") * 2 + bytes([8, 2, 0, 0, 0])
-
-    def chunk(name: bytes, content: bytes) -> bytes:
-        checksum = zlib.crc32(name + content).to_bytes(4, "big")
-        return len(content).to_bytes(4, "big") + name + content + checksum
-
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", size) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
-
-
-def event(content: bytes) -> bytes:
-    """A record of an event file."""
-    length = struct.pack("<Q", len(content))
-    return b"".join([length, _checksum(length), content, _checksum(content)])
-
-
-def events(content: Callable[[], bytes]) -> Spoil:
+@spoiling
+def events(run: Path, base: Path, content: Callable[[], bytes]) -> None:
     """Another content of the file for TensorBoard."""
-    return lambda run, base: next(run.glob("events*")).write_bytes(content())
-
-
-def exabyte() -> bytes:
-    """A record that claims to be that long."""
-    length = struct.pack("<Q", 2**60)
-    return length + _checksum(length) + b"x"
+    next(run.glob("events*")).write_bytes(content())
 
 
 # ---- damage of one kind ------------------------------------------------------------------------------------
@@ -371,24 +327,20 @@ def exabyte() -> bytes:
 
 def nested_settings(run: Path, base: Path) -> None:
     """As deep as JSON goes."""
-    head, begin, tail = (run / "manifest.json").read_text().partition('"arguments": {')
-    (run / "manifest.json").write_text(
-        head + begin + '"deep": ' + '{"a":' * 900 + "1" + "}" * 900 + "," + tail
-    )
+    deep = '"arguments": {"deep": ' + '{"a":' * 900 + "1" + "}" * 900 + ","
+    text = (run / "manifest.json").read_text()
+    (run / "manifest.json").write_text(text.replace('"arguments": {', deep, 1))
 
 
-def guessed_names(*names: str) -> Spoil:
+@spoiling
+def guessed_names(run: Path, base: Path, *names: str) -> None:
     """Links to the outside for files, and for those that a reader would write first, in `recording`."""
-
-    def spoil(run: Path, base: Path) -> None:
-        for name in names:
-            target = base / "outside" / ("" if name == "frames" else name)
-            linked(f"recording/{name}", str(target))(run, base)
-            for process in range(os.getpid(), os.getpid() + 2000):  # the reader's may be guessed
-                for kind in ("part", "old.part"):
-                    (run / "recording" / f".{name}.{process}.{kind}").symlink_to(target)
-
-    return spoil
+    for name in names:
+        target = base / "outside" / ("" if name == "frames" else name)
+        linked(f"recording/{name}", str(target))(run, base)
+        for process in range(os.getpid(), os.getpid() + 2000):  # the reader's may be guessed
+            for kind in ("part", "old.part"):
+                (run / "recording" / f".{name}.{process}.{kind}").symlink_to(target)
 
 
 def hydra_files(run: Path, base: Path) -> None:
@@ -425,7 +377,7 @@ _ESCAPES = "\x1b]0;owned\x07\x1b[2J\r\n\u202e"
 _SCRIPT = "<script>fetch('//x')</script><img src=x onerror=alert(1)>{{7*7}}](javascript:x)"
 _HUNGRY = "its network: would take about"
 _NO_WORLD = "world.npz: not a world that can be read"
-_RESUMED = "resumed must be a list of when the run went on"
+_RESUMED = "resumed must be a list of resumptions"
 
 
 def model(**changes: Content) -> Spoil:
@@ -455,63 +407,46 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
     ("pickle_as_weights", "not a model of dqn", model(policy__pth=pickled())),
     ("pickle_in_torchs_own_file", "its pickle asks for posix system",
      model(policy__pth=torch_file(pickled(2)))),
-    ("pickle_of_a_newer_protocol", "its pickle asks for", model(policy__pth=torch_file(pickled(4)))),
-    ("pickle_beside_the_weights", "not a model of dqn", model(evil__pth=pickled())),
     ("pickle_as_sb3s_variables", FINE, model(pytorch_variables__pth=pickled())),
     ("pickle_that_asks_for_memory", "its pickle asks for builtins bytearray",
      model(policy__pth=torch_file(b"\x80\x02cbuiltins\nbytearray\n\x8a\x05\x00\xe8vH\x17\x85R."))),
     ("zip_bomb", "compressed members", packed("model.zip", "policy.pth", 2**28)),
     ("zip_bomb_inside", "compressed members", model(policy__pth=torch_file(lambda _: bytes(2**28), _PACKED))),
-    ("zip_whose_members_share_their_bytes", "members are larger than itself",
-     file("model.zip", shared_members)),
     ("a_tensor_without_numbers", "its pickle asks for torch._utils _rebuild_sparse_tensor",
      tensor(lambda there: there.to_sparse())),
     ("a_tensor_of_a_trillion_numbers", "it must be float32",
      tensor(lambda _: torch.zeros(1).expand(_TRILLION))),
-    ("weights_that_are_no_numbers", "holds numbers that are not finite",
+    ("weights_that_are_no_numbers", "contains numbers that are not finite",
      tensor(lambda there: there.fill_(float("nan")))),
-    ("weights_of_another_type", "it must be float32", tensor(lambda there: there.double())),
-    ("weights_left_out", "is missing", tensor(lambda _: None)),
     ("exploration_beyond_all_bounds", "exploration_rate=7.0: must be from 0 to 1",
      model(data=b'{\n    "exploration_rate": 7\n}')),
     ("one_weight_changed_and_not_sealed", "is not the file that the run wrote",
      unsealed("model.zip", tensor(lambda there: there + torch.eye(*there.shape)))),
     ("checksums_taken_out", "has no checksum (sha256) of model.zip", said(sha256={})),
-    ("model_that_is_the_secret", "model.zip: is a symbolic link", linked("model.zip", "{base}/secret.txt")),
     ("model_that_never_ends", "model.zip: is a symbolic link", linked("model.zip", "/dev/zero")),
     ("model_that_waits_for_a_writer", "model.zip: is not an ordinary file", waiting("model.zip")),
-    ("model_of_twenty_gigabytes", "model.zip: is larger than", grown("model.zip", 20 * 2**30)),
     # settings
-    ("target_among_an_optimisers_arguments", "optimizer_kwargs.eps._target_=os.system is not a plain word",
+    ("target_among_an_optimisers_arguments", "optimizer_kwargs.eps._target_=os.system is neither a plain",
      settings({f"{_KWARGS}.optimizer_kwargs": {"eps": {"_target_": "os.system", "command": _CANARY}}})),
-    ("function_in_a_classs_place", "activation_fn=os.system is from none of",
+    ("function_in_a_classs_place", "activation_fn=os.system is not from one of",
      settings({f"{_KWARGS}.activation_fn": "os.system"})),
-    ("function_of_a_known_library", "must be the import path of a",
-     settings({f"{_KWARGS}.features_extractor_class": "stable_baselines3.common.save_util.load_from_pkl"})),
     ("class_that_opens_a_file", "agent.replay_buffer_kwargs.filename_or_file=",
      settings({"agent.replay_buffer_class": "stable_baselines3.common.logger.HumanOutputFormat",
                "agent.replay_buffer_kwargs": {"filename_or_file": "{base}/outside/log"}})),
-    ("a_replay_of_a_trillion_steps", FINE, settings({"agent.buffer_size": 10**13})),
     ("a_replay_of_gigabytes", FINE, settings({"agent.buffer_size": 500_000_000}), 1000),
-    ("a_network_of_a_trillion_weights", "must be layer widths",
-     settings({f"{_KWARGS}.net_arch": [10**6, 10**6]})),
     ("sixteen_layers_of_4096", _HUNGRY, settings({f"{_KWARGS}.net_arch": [4096] * 16}), 1000),
     ("images_of_cells_of_400_pixels", "image, cells of 400 pixels: would take about",
      _seen_as_image(400), 1000),
-    ("images_that_fill_the_memory", _HUNGRY, all_of(_seen_as_image(4), _corridors(66, 64)), 1000),
 ],
 "qrdqn": [
-    ("algorithm_of_ones_own", "algorithm=evil.Agent is from none of",
+    ("algorithm_of_ones_own", "algorithm=evil.Agent is not from one of",
      settings({"agent.algorithm": "evil.Agent"})),
-    ("policy_of_ones_own", "policy=evil.Agent is from none of", settings({"agent.policy": "evil.Agent"})),
-    ("class_deep_among_the_arguments", "optimizer_class=evil.Agent is not a plain word",
+    ("class_deep_among_the_arguments", "optimizer_class=evil.Agent is neither a plain",
      _argument(policy_kwargs=[[{"x": [{"optimizer_class": "evil.Agent"}]}]])),
     ("log_folder_among_the_arguments", "agent.arguments.tensorboard_log=",
      _argument(tensorboard_log="{base}/outside")),
     ("settings_nested_as_deep_as_json_goes", "nested too deeply", nested_settings),
     ("ten_million_quantiles", _HUNGRY, _argument(policy_kwargs={"n_quantiles": 10_000_000}), 1000),
-    ("many_quantiles_of_every_state", _HUNGRY,
-     all_of(_argument(policy_kwargs={"n_quantiles": 20_000}), _corridors(64, 62)), 1000),
 ],
 "lake": [
     ("environment_of_a_module", FINE, world(id="evil:FrozenLake-v1")),
@@ -519,15 +454,12 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
      world(id="gridworld:GridWorld-v0", kwargs={"layout": "{base}/secret.txt"})),
     ("environment_of_four_million_cells", FINE,
      world(kwargs={"desc": ["S" + "F" * 1998 + "G"] * 2000}), 1000),
-    ("environment_of_another_kind", FINE, world(id="Pendulum-v1", kwargs={})),
     ("environment_that_a_command_builds", FINE,
      settings({"env": {"source": "built", "builder": "os.system", "kwargs": {"command": _CANARY},
                        "max_episode_steps": None}})),
     ("world_that_is_the_secret", "world.npz: is a symbolic link", linked("world.npz", "{base}/secret.txt")),
-    ("world_that_never_ends", "world.npz: is a symbolic link", linked("world.npz", "/dev/zero")),
-    ("world_that_waits_for_a_writer", "world.npz: is not an ordinary file", waiting("world.npz")),
     ("world_of_450_megabytes", "world.npz: would take about 1.35 GB", grown("world.npz", 450_000_000)),
-    ("world_that_grows", f"{_NO_WORLD} (its members are larger than itself)",
+    ("world_that_grows", f"{_NO_WORLD} (its members are larger than the file)",
      members("world.npz", {"own_observation.npy": lambda _: npy("|u1", 2 * 10**8) + bytes(2 * 10**8)},
              _PACKED)),
     ("world_whose_header_is_cut_off", f"{_NO_WORLD} (('EOF in multi-line",
@@ -542,17 +474,15 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
     # a table's files
     ("pickle_in_a_table", "Object arrays cannot be loaded", model(q__npy=pickled_array)),
     ("table_of_a_trillion_numbers", "not a model of sarsa", model(q__npy=npy("<f8", _TRILLION))),
-    ("table_that_is_a_bomb", "its members are larger than itself", packed("model.zip", "q.npy", 2**28)),
+    ("table_that_is_a_bomb", "its members are larger than the file", packed("model.zip", "q.npy", 2**28)),
     ("pickle_as_visits", FINE, file("visits.npy", pickled_array)),
     ("visits_that_are_the_secret", FINE, linked("visits.npy", "{base}/secret.txt")),
-    ("visits_of_a_trillion_cells", FINE, file("visits.npy", npy("<i8", _TRILLION, 4))),
     ("visits_whose_header_is_cut_off", FINE, file("visits.npy", npy_header("(((("))),
     # settings
     ("target_among_the_settings", "config.agent: has an unknown key _target_",
      settings({"agent._target_": "os.system", "agent.command": _CANARY})),
     ("interpolation_in_names", "policy of run on ${oc.env:HOME}",
      settings({"agent.name": _SECRET_WORD, "env.layout": "${oc.env:HOME}"})),
-    ("interpolation_in_the_map", "unknown tile", said(layout=[_SECRET_WORD])),
     ("interpolation_in_a_number", "must be float", settings({"env.slip": _SECRET_WORD})),
     ("map_file_that_is_the_secret", FINE, settings({"env.layout": "secret.txt"})),
     ("map_file_elsewhere_that_is_the_secret", FINE, world(layout="{base}/secret.txt")),
@@ -570,14 +500,10 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
     ("manifest_that_waits_for_a_writer", "manifest.json: is not an ordinary file", waiting("manifest.json")),
     ("names_that_act_on_the_terminal", "config.agent.name='\\x1b]0;owned",
      settings({"agent.name": _ESCAPES})),
-    ("status_that_acts_on_the_terminal", "this run is '\\x1b[2J",
-     said(status="\x1b[2J", error="\x1b[31m" * 1000)),
     ("names_that_are_no_text", "must be a plain name", settings({"env.layout": "\ud800\x00"})),
     ("a_megabyte_in_a_numbers_place", "config.seed=a list: must be int",
      settings({"seed": ["\x1b"] * 10**5})),
-    ("continuations_that_are_no_list", _RESUMED, said(resumed={"a": 1})),
     ("continuations_without_a_step", _RESUMED, said(resumed=[{"total_timesteps": 1}])),
-    ("continuations_after_no_number_of_steps", _RESUMED, said(resumed=[{"total_timesteps": 1, "step": "x"}])),
     ("numbers_that_json_has_not", "manifest.json: is not JSON",
      said(reached=float("nan"), seed=float("inf"))),
     # what the report shows
@@ -585,23 +511,16 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
     ("curve_of_a_million_columns", FINE,
      file("curve.csv", lambda _: (",".join(map(str, range(10**6))) + "\n" + "1," * 10**6 + "\n").encode())),
     ("curve_of_millions_of_short_rows", FINE, file("curve.csv", lambda _: b"ab,12\n" * 10_000_000), 1000),
-    ("curve_that_is_the_secret", FINE, linked("curve.csv", "{base}/secret.txt")),
     ("curve_that_waits_for_a_writer", FINE, waiting("curve.csv")),
     ("summary_that_is_the_secret", FINE, linked("summary.json", "{base}/secret.json")),
     ("picture_that_is_the_secret", FINE, linked("policy.png", "{base}/secret.png")),
-    ("picture_of_eighty_million_pixels", FINE,
-     lambda run, base: (run / "policy.png").write_bytes(png(9_000))),
-    ("picture_that_waits_for_a_writer", FINE, waiting("learning.gif")),
     ("films_that_are_the_secret", FINE,
      all_of(linked("episode.gif", "{base}/secret.png"), linked("episode.mp4", "/dev/zero"))),
-    ("event_of_an_exabyte", FINE, events(exabyte)),
+    ("event_of_an_exabyte", FINE, events(lambda: event(b"x", 2**60))),
     # field 5 of a record is its summary, whose field 1 is a value: 20 million empty ones
     ("event_of_many_empty_values", FINE,
      events(lambda: event(b"\x2a\x80\xb4\x89\x13" + b"\n\0" * 20_000_000)), 1000),
-    ("a_million_events", FINE,  # step 1, a = 1
-     events(lambda: event(b"\x10\x01\x2a\x0a\n\x08\n\x01a\x15\0\0\x80\x3f") * 10**6), 1000),
     ("events_that_wait_for_a_writer", FINE, waiting("events.out.tfevents.0.a.1")),
-    ("events_that_are_the_secret", FINE, linked("events.out.tfevents.0.a.1", "{base}/secret.txt")),
     # where things are written
     ("recordings_that_lead_outside", FINE, linked("recording", "{base}/outside")),
     ("frames_that_lead_outside", FINE,
@@ -628,7 +547,6 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
      newest_checkpoint(lambda _: b'{"arrays":[],"state":{"a":[' + b"[],[]," * 10_000_000 + b"[]]}}"), 1000),
     ("checkpoint_of_an_array_that_is_left_out", FINE,
      newest_checkpoint(b'{"a":{"@":"a"}}', {"a.npy": npy("<f8", 30_000_000_000)}), 1000),
-    ("checkpoint_of_zeros_that_are_packed", FINE, packed(LAST, "a.npy", 2 * 10**9), 1000),
 ],
 }
 # fmt: on

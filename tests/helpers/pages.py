@@ -71,6 +71,8 @@ def shortened(words: list[str]) -> list[str]:
         return [program, *rest, "--cfg"]  # reads the search space; another study searches
     if program == "tune.py":
         return [program, *_replaced(rest, [*_FEW_TRIALS, *_FEW_STEPS])]
+    if program == "report.py":
+        return [program, *rest, "--formats"]  # the page alone
     if program != "train.py":
         return [program, *rest]
     if any(word.startswith("resume=") for word in rest):
@@ -148,7 +150,7 @@ class Reader:
 
     def _run(self, line: str) -> subprocess.CompletedProcess[str]:
         words = shlex.split(line)
-        variables = dict(word.split("=", 1) for word in words if word.startswith("PYTHONPATH="))
+        variables = dict(word.split("=", 1) for word in words if re.match(r"[A-Z_]+=", word))
         program, *words = words[len(variables) :]
         if program == "tensorboard":
             reads = str(Path(sys.executable).with_name(program))

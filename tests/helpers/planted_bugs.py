@@ -1,4 +1,4 @@
-"""PPO, A2C, DQN and QR-DQN with one bug each, as implementations have them.
+"""PPO, A2C and DQN with one bug each, as implementations have them.
 
 Each call below makes a class of this module: its name, what is wrong with it, the probes that it must fail
 (the first is its own), and the methods that are changed, of the algorithm, of its buffer or of its policy.
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from sb3_contrib import QRDQN
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -189,10 +188,6 @@ _bug(
     _update_info_buffer=lambda _, update, infos, *dones: update(_without_timeouts(infos), *dones),
 )
 _policy_bug(
-    "PPOColumnsSwapped", PPO, "It sees the first two columns in another order when it acts.", "behaviour",
-    forward=lambda _, forward, obs, *rest: forward(_swapped(obs)),
-)
-_policy_bug(
     "PPOColumnsReversed", PPO, "It sees all columns in the opposite order when it acts.", "behaviour",
     forward=lambda _, forward, obs, *rest: forward(obs.flip(1)),
 )
@@ -217,12 +212,11 @@ for _name, _base, _what, _factor in (
     ("PPOEntropySign", PPO, "Entropy is a cost.", -1.0),
     ("A2CEntropySign", A2C, "Entropy is a cost.", -1.0),
     ("A2CNoEntropy", A2C, "The entropy bonus is forgotten.", 0.0),
-    ("PPOEntropySummed", PPO, "Entropy is summed over the samples, not averaged.", 256.0),
     ("PPOEntropyInBits", PPO, "Entropy is measured in bits.", 1 / np.log(2)),
 ):
     _bug(_name, _base, _what, "entropy", train=_bonus_times(_factor))
 
-# ---- DQN and QR-DQN ----------------------------------------------------------------------------------------
+# ---- DQN ----------------------------------------------------------------------------------------
 
 _bug(
     "NoTargetNetwork", DQN, "The targets are computed with the network that learns.", "target",
@@ -258,8 +252,6 @@ _bug(
 )
 for _name, _what, _probes, _rate in (
     ("EpsilonNeverFalls", "It explores as much at the end as at the beginning.", "behaviour", lambda _: 1.0),
-    ("EpsilonStaysAtThird", "Epsilon never falls below 0.3.", "behaviour",
-     lambda m: max(m.exploration_rate, 0.3)),
     ("EpsilonStaysAtTenth", "Epsilon never falls below 0.1.", "behaviour",
      lambda m: max(m.exploration_rate, 0.1)),
     ("EpsilonRises", "It explores more and more.", "behaviour exploration",
@@ -270,19 +262,10 @@ for _name, _what, _probes, _rate in (
 ):
     _bug(_name, DQN, _what, _probes, _on_step=_after(exploration_rate=_rate))
 _bug(
-    "EpsilonFallsLate", DQN, "Epsilon falls to its end over all of training, whatever the fraction.",
-    "behaviour",
-    _setup_model=_during(exploration_fraction=lambda _: 1.0),
-)
-_bug(
     "EpsilonCountsCalls", DQN,
     "Epsilon falls with the calls of `step`, not with the steps of all environments.", "behaviour",
     _on_step=_during(
         _current_progress_remaining=lambda m: 1 - (1 - m._current_progress_remaining) / m.n_envs),
-)
-_bug(
-    "QRDQNEpsilonNeverFalls", QRDQN, "It explores as much at the end as at the beginning.", "behaviour",
-    _on_step=_after(exploration_rate=lambda m: m.exploration_initial_eps),
 )
 _bug(
     "DQNFrozenLayer", DQN, "The last layer has no gradient.", "layers",

@@ -1,24 +1,26 @@
 """What several tests of resuming need: runs that stop where they are told to, and everything a run leaves."""
 
+import contextlib
 import csv
+import itertools
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.support import configure
+from helpers.support import train_in as begin
 from tensorboard.compat.proto.event_pb2 import Event
 
-from gridworld.agents import sb3, tabular
 from gridworld.restore.resume import open_unfinished, unfinished_of
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.reader import is_started
 from gridworld.storage.serialization import decode
 from gridworld.training.together import run_together
-from gridworld.training.train import train, training
+from gridworld.training.train import training
 
 OF_THE_CLOCK = {"train_seconds", "evaluation_seconds"}
 TIMED_FILES = (
@@ -30,11 +32,6 @@ TIMED_TAGS = ("time/fps", "_hparams_", "run/command", "run/settings")
 
 class Crash(BaseException):
     """Stands in for the process being killed."""
-
-
-def begin(folder: Path, *overrides: str) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    train(configure(*overrides), folder, list(overrides))
 
 
 def begin_all(runs: Sequence[tuple[Path, Sequence[str]]]) -> list[Any]:
@@ -58,23 +55,39 @@ def begin_or_go_on(folder: Path, *overrides: str) -> None:
 
 def stopped_after(number: int, folder: Path, *overrides: str) -> None:
     """A run whose process dies right after so many checkpoints."""
+    with crashing_after(number):
+        begin(folder, *overrides)
+
+
+@contextlib.contextmanager
+def crashing_after(number: int) -> Iterator[None]:
+    """The same of whatever is done in here."""
+
+    def crash() -> None:
+        raise Crash
+
     with pytest.MonkeyPatch.context() as patched:
-        crash_after(patched, number)
+        patched.setattr(Checkpoints, "save", at_call(number, crash, Checkpoints.save, after=True))
         with pytest.raises(Crash):
-            begin(folder, *overrides)
+            yield
 
 
-def crash_after(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
-    save, count = Checkpoints.save, 0
+def at_call(
+    number: int, act: Callable[[], object], original: Callable[..., Any], after: bool = False
+) -> Callable[..., Any]:
+    """The function, where this happens too in its n-th call and all later ones, before or after its work."""
+    calls = itertools.count(1)
 
-    def dying(*arguments: Any, **options: Any) -> None:
-        nonlocal count
-        save(*arguments, **options)
-        count += 1
-        if count == number:
-            raise Crash
+    def call(*arguments: Any, **options: Any) -> Any:
+        is_due = next(calls) >= number
+        if is_due and not after:
+            act()
+        answer = original(*arguments, **options)
+        if is_due and after:
+            act()
+        return answer
 
-    monkeypatch.setattr(Checkpoints, "save", dying)
+    return call
 
 
 def points(folder: Path) -> list[tuple[Any, ...]]:
@@ -118,8 +131,8 @@ def weights(content: bytes, folder: Path) -> dict[str, Any]:
         return {}
     path = folder / ".model_to_compare"
     path.write_bytes(content)
-    family = tabular if b"algorithm.npy" in content else sb3
-    found = family.weights(path, 10**8)
+    agent = configure("agent=sarsa" if b"algorithm.npy" in content else "agent=dqn").agent
+    found = agent.weights(path, 10**8)
     path.unlink()
     return found
 

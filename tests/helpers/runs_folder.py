@@ -105,7 +105,7 @@ class Maker:
 
 
 def sweep(folder: Path, seeds: int = 20) -> Path:
-    """A study: three agents on three tasks; on the cliff, two of them with on-line returns."""
+    """A study: three agents on three tasks; on the cliff, two of them with online returns."""
     rng = np.random.default_rng(1)
     for env in ("classic", "four_rooms"):
         maker = Maker("agent=ppo", f"env={env}")

@@ -8,8 +8,8 @@ from hydra.experimental.callback import Callback
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 
-from gridworld.agents import sb3
 from gridworld.agents.sb3 import factory
+from gridworld.agents.sb3.settings import SB3Config
 from gridworld.engine.networks import DenseNetworks
 
 _backward = DenseNetworks.backward
@@ -23,7 +23,7 @@ def _leaning_on_the_others(self: DenseNetworks, *slopes: NDArray[Any]) -> None:
 
 def stand_in(patch: Callable[[Any, str, Any], None] = setattr) -> None:
     """Let `device=cuda` train on the processor, by the code for CUDA."""
-    patch(sb3, "on_processor", lambda device: device != "cuda")
+    patch(SB3Config, "on_processor", lambda self, device: device != "cuda")
     patch(factory, "_device", lambda name: "cpu" if name == "cuda" else name)
     patch(DenseNetworks, "backward", _leaning_on_the_others)
 

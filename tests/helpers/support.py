@@ -8,6 +8,8 @@ import resource
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import hydra
@@ -57,7 +59,6 @@ NO_FILES = (
     *("logging.tensorboard=false", "logging.progress=false"),
 )
 DEEP = ["dqn", "ppo"]  # those with a tabulated engine
-LEARNING = [agent for agent in SHORT if agent != "value_iteration"]
 
 
 def configure(*overrides: str) -> TrainConfig:
@@ -141,6 +142,19 @@ def script(
 def start(name: str, *words: str, cwd: Path, **environment: str) -> forks.Started:
     """Start one of the scripts, to be watched and stopped: in a fork too, in a session of its own."""
     return forks.Started(name, words, cwd, environment)
+
+
+def wait_for(
+    condition: Callable[[], object],
+    what: str,
+    process: subprocess.Popen[bytes] | forks.Started | None = None,
+) -> None:
+    """Until it holds, while the process is at work. Fails after three minutes."""
+    end = time.monotonic() + 180
+    while not condition():
+        assert time.monotonic() < end, f"waited for {what}"
+        assert process is None or process.poll() is None, f"{what} ended"
+        time.sleep(0.02)
 
 
 def train_on_full_disk(most: int, *words: str, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -23,7 +23,7 @@ def rows(sweep: Path) -> dict[str, dict[str, str]]:
 def logged(run: Path) -> list[str]:
     """The lines of `train.log`, without times and commands."""
     lines = (run / "train.log").read_text().splitlines()
-    return [re.sub(r"^\S+ |(?<=begins: ).*|(?<=goes on: ).*", "", line) for line in lines]
+    return [re.sub(r"^\S+ |(?<=starts: ).*", "", line) for line in lines]
 
 
 def everything(run: Path) -> dict[str, Any]:

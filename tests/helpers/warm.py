@@ -34,7 +34,7 @@ import numpy as np
 import PIL.Image
 import torch
 from helpers.forks import megabytes
-from helpers.quickly import collapse_memory, compose_quickly
+from helpers.quickly import compose_quickly
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
@@ -63,7 +63,7 @@ _WORDS = (
 )
 # What is imported only once it is needed.
 _LATE = (
-    *("sb3_contrib", "torch.utils.tensorboard", "torch.utils.serialization", "torch._dynamo", "av"),
+    *("sb3_contrib", "torch.utils.tensorboard", "torch.utils.serialization", "av"),
     *("optuna.storages._rdb.storage", "optuna.storages._rdb.models", "sqlalchemy.orm"),
     *("sqlalchemy.dialects.sqlite.pysqlite", "alembic.command", "alembic.config", "alembic.migration"),
     *("optuna.importance._fanova", "gridworld.report.agent_charts", "gridworld.report.setting_charts"),
@@ -102,7 +102,6 @@ def _prepare() -> None:
     for finalizer in list(weakref.finalize._registry):  # type: ignore[attr-defined]
         finalizer.atexit = False  # what imported modules do at the end, for torch half of a script's time
     gc.freeze()  # so that a fork shares what is there
-    collapse_memory()
     gc.set_threshold(50_000)
     gc.enable()
 

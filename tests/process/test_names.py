@@ -12,7 +12,7 @@ import pytest
 from helpers.hostile import manifest
 from helpers.support import SHORT, train_in
 
-from gridworld.commands import evaluate, jobs, record, report, reproduce, run
+from gridworld.commands import evaluate, jobs, report, reproduce, run
 from gridworld.commands import train as train_command
 from gridworld.config.train import TrainConfig
 from gridworld.process.console import prepare
@@ -54,8 +54,6 @@ def test_what_commands_and_reports_say_of_a_run(
     place = runs / EVIL
     shutil.copytree(good, place)
     assert SHOWN in told(evaluate.main, capsys, place, "--episodes", 5)[0]
-    (line,) = told(record.main, capsys, place, "--format", "policy")
-    assert line.endswith("/recording/policy.png")
     assert SHOWN in told(reproduce.main, capsys, place)[0]
     (line,) = told(train_command.resume, capsys, f"resume={place}")
     assert line.startswith("error: ")

@@ -20,7 +20,7 @@ ASCII = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"}
 MAP = "mäp.txt"
 FULL = (
     "error: standard output: cannot be written (No space left on device), "
-    "what was printed is not complete; send it to where there is room\n"
+    "so the output is incomplete; write it to a disk with free space\n"
 )
 
 
@@ -64,7 +64,7 @@ def test_progress(
     shown = capsys.readouterr().err.removesuffix("\n")
     start, middle, end = shown.removeprefix("\r").split("\r" if in_place else "\n")
     assert start == r"dqn on\x1bmap: step 0 of 2,000 (0%), a long note"
-    assert middle.rstrip() == r"dqn on\x1bmap: step 1,000 of 2,000 (50%), about 0 s left, b"
+    assert middle.rstrip() == r"dqn on\x1bmap: step 1,000 of 2,000 (50%), b, about 0 s left"
     assert end.rstrip() == r"dqn on\x1bmap: step 2,000 of 2,000 (100%), c"
     assert (len(end) == len(middle)) == in_place  # a line covers the one before
     console.Progress(10, "x", enabled=False).update(1, "y")
@@ -79,15 +79,6 @@ def test_names_in_a_locale_without_utf8(environment: dict[str, str], tmp_path: P
     assert done.returncode == 0, done.stderr
     assert "q_learning on m\\" in done.stdout  # with the sign as a number
     assert done.stdout.isascii()
-    for line in (
-        *("evaluate.py run", "record.py run --format policy"),
-        *("report.py run --formats", "reproduce.py run"),
-    ):
-        looked = script(*line.split(), cwd=tmp_path, **environment)
-        assert looked.returncode == 0, looked.stderr
-        assert (looked.stdout + looked.stderr).isascii()
-        if environment is ASCII:
-            break  # the others print in the same way
     refused = script("train.py", "env.layout='nö.txt'", cwd=tmp_path, **environment)
     assert refused.returncode == 2
     assert refused.stderr.startswith("error: layout 'n")
@@ -106,10 +97,10 @@ def test_what_there_was_no_room_for_is_an_error(tmp_path: Path) -> None:
     entry = {"job": "seed=0", "hash": "x", "overrides": ["seed=0"]}
     content = {"asked": [{"overrides": ["seed=0"]}], "jobs": [entry]}
     (tmp_path / "sweep" / "sweep.json").write_text(json.dumps(sealed(content)))
-    lines = [f"{path.name} --help" for path in (ROOT / "scripts").glob("*.py")]
-    lines += ["train.py --cfg job", "train.py --version", "tune.py agent=ppo --cfg", "jobs.py sweep"]
-    lines += ["evaluate.py sweep/seed=0", "record.py sweep/seed=0 --format policy"]
-    for line in lines:
+    for line in (
+        *("train.py --help", "report.py --help", "train.py --cfg job", "train.py --version", "jobs.py sweep"),
+        *("tune.py agent=ppo --cfg", "evaluate.py sweep/seed=0", "record.py sweep/seed=0 --format policy"),
+    ):
         ended = script(*line.split(), cwd=tmp_path, stdout=Path("/dev/full"))
         assert (ended.returncode, ended.stderr) == (2, FULL), line
     assert (folder / "recording" / "policy.png").exists()

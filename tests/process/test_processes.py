@@ -1,5 +1,6 @@
-"""Tasks in processes: what comes back, in what order, and what a killed process or a signal leaves."""
+"""Tasks in processes and signals: what comes back, and what a killed process or an interruption leaves."""
 
+import io
 import os
 import signal
 import threading
@@ -11,16 +12,13 @@ from typing import Any
 
 import pytest
 
-from gridworld.process.processes import LostError, run_in_processes
+from gridworld.process.processes import LostError, Processes
+from gridworld.process.signals import Interrupted, StopRequest
 
 
 def run(tasks: Sequence[Callable[[], Any]], count: int = 2, forks: bool = True) -> list[Any]:
     found: dict[int, Any] = {}
-    waiting = list(tasks)
-    run_in_processes(
-        lambda: waiting.pop(0) if waiting else None,
-        *(count, forks, lambda task, result: found.update({tasks.index(task): result})),
-    )
+    Processes(count, forks).run(tasks, lambda task, result: found.update({tasks.index(task): result}))
     return [found[number] for number in range(len(tasks))]
 
 
@@ -74,3 +72,41 @@ def test_a_signal_is_passed_on_once_and_all_processes_end_first(tmp_path: Path) 
     thread.join()
     assert ended.value.code == 128 + signal.SIGTERM
     assert {path.name for path in tmp_path.glob("closed *")} == {"closed 0", "closed 1"}
+
+
+class Interruptible(io.BytesIO):
+    """A file that SIGTERM comes for once it has some bytes."""
+
+    asked = False
+
+    def write(self, data: Any) -> int:
+        if self.tell() and not self.asked:
+            self.asked = True
+            os.kill(os.getpid(), signal.SIGTERM)
+        return super().write(data)
+
+
+def test_an_interruption_stays_one_where_a_cleanup_fails() -> None:
+    """torch's writer, interrupted, raises an error of its own as it closes its file."""
+    import torch  # which the processes above need not import
+
+    def save() -> None:
+        with StopRequest().listening():
+            torch.save({"weights": torch.zeros(100)}, Interruptible())
+
+    with pytest.raises(Interrupted, match="stopped by SIGTERM"):
+        save()
+
+
+def test_another_failure_stays_what_it_is() -> None:
+    def fail() -> None:
+        with StopRequest().listening():
+            try:
+                raise KeyError("cause")
+            except KeyError:
+                raise ZeroDivisionError  # noqa: B904
+
+    with pytest.raises(ZeroDivisionError) as caught:
+        fail()
+    assert isinstance(caught.value.__context__, KeyError)
+    assert not caught.value.__suppress_context__

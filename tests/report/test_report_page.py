@@ -17,7 +17,7 @@ SIZES = {"phone": (390, 844), "desktop": (1280, 900)}
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A study with everything in it: pictures, on-line returns, split configurations, a run that failed."""
+    """A study with everything in it: pictures, online returns, split configurations, a run that failed."""
     runs = sweep(tmp_path_factory.mktemp("study") / "runs", 6)
     for seed in (0, 1):
         own = ["env=aima_4x3", "agent.ent_coef=0.05", "evaluation.every=2000"]  # by chance, one is certified
@@ -74,7 +74,7 @@ def test_a_browser_shows_it(page: Path, tmp_path: Path) -> None:
         ):
             assert words in text, words
         images = browser.execute_script("return [...document.images].map(i => [i.complete, i.naturalWidth])")
-        # Of the one run with pictures policy, error, visits, learning; on two of four tasks on-line returns.
+        # Of the one run with pictures policy, error, visits, learning; on two of four tasks online returns.
         assert len(images) == 4 + (4 * 4 + 2 * 3 + 3)
         assert all(complete and width > 100 for complete, width in images)
         large = browser.execute_script(

@@ -18,13 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.hostile import seal
 from helpers.resuming import go_on, stopped_after
 from helpers.runs_folder import Maker, write_study, write_sweep
 from helpers.support import SHORT, train_in
 
 from gridworld.commands import jobs as jobs_command
-from gridworld.commands import record as record_command
 from gridworld.config.train import PICTURES
 from gridworld.errors import InputError
 from gridworld.report import tuning_study as tuning
@@ -68,7 +66,7 @@ def evaluated(folder: Path) -> str:
 def recorded(folder: Path) -> str:
     saved = SavedRun(folder / "run")
     visits = read_visits(saved.run, saved.mdp.neighbour.shape)
-    return f"{record_command._SavedSubject(saved, False).steps} {visits}"
+    return f"{saved.steps()} {visits}"
 
 
 def gone_on(folder: Path) -> str:
@@ -193,9 +191,7 @@ def test_how_far_an_unfinished_run_came_is_told_as_not_verified(tmp_path: Path) 
     content = json.loads((run / "manifest.json").read_text()) | {"status": "interrupted"}
     (run / "manifest.json").write_text(json.dumps(sealed(content)))
     (sentence,) = gather([tmp_path]).sentences()
-    assert (
-        "last evaluated after 20,000 steps, says curve.csv, which is not verified before the end" in sentence
-    )
+    assert "last evaluated after 20,000 steps, according to the unverified curve.csv" in sentence
 
 
 def in_json(path: Path, **values: object) -> None:
@@ -210,17 +206,13 @@ def pipe(path: Path) -> None:
 JOB = {"job": "seed=0", "hash": "1" * 32, "overrides": ["seed=0"]}
 HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "sweep.json is a pipe": (lambda sweep: pipe(sweep / "sweep.json"), "error: .*is not an ordinary file"),
-    "sweep.json is nested": (
-        lambda sweep: (sweep / "sweep.json").write_text('{"a":' * 10**5),
-        r"error: .*sweep.json: (damaged|is empty or cut off)",
-    ),
     "overrides are numbers": (
         lambda sweep: in_json(sweep / "sweep.json", jobs=[JOB | {"overrides": [1]}]),
         r"error: .*sweep.json: damaged \(overrides must be a command line.s words\)",
     ),
     "jobs of one folder": (
         lambda sweep: in_json(sweep / "sweep.json", jobs=[JOB, JOB | {"hash": "2"}]),
-        r"error: .*sweep.json: damaged \(two jobs have one folder, or one hash\)",
+        r"error: .*sweep.json: damaged \(two jobs have the same folder or hash\)",
     ),
     "jobs.csv is a pipe": (lambda sweep: pipe(sweep / "jobs.csv"), "3 jobs: 1 pending, 1 done, 1 failed"),
     "jobs.csv is huge": (
@@ -231,20 +223,9 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda sweep: pipe(sweep / "seed=0" / "summary.json"),
         "failed .*summary.json: is not an ordinary file",
     ),
-    "a regret beyond all numbers": (
-        lambda sweep: (
-            in_json(sweep / "seed=0" / "summary.json", regret=10**400),
-            seal(sweep / "seed=0", "summary.json"),
-        ),
-        "failed .*summary.json: is not JSON, .*is too large a number",
-    ),
     "a status that is a list": (
         lambda sweep: in_json(sweep / "seed=0" / "manifest.json", status=[]),
         "failed .*manifest.json: status must be a word",
-    ),
-    "an error that is a number": (
-        lambda sweep: in_json(sweep / "seed=0" / "manifest.json", error=1),
-        "failed .*manifest.json: error must be a sentence",
     ),
 }
 
@@ -278,21 +259,16 @@ def test_a_checkpoint_of_an_impossible_number_is_passed_over(
         path.rename(path.with_name(f"{value}.state"))
     go_on(tmp_path / "run")
     told = capsys.readouterr().err
-    assert ".state: passed over, it " in told
+    assert ".state: skipped, its " in told
     assert read_run(tmp_path / "run").is_finished
 
 
-@pytest.mark.parametrize("value", [10**400, 10**19, -(10**30)])
-@pytest.mark.parametrize("name", ["study.json", "search.json"])
-def test_a_study_with_a_number_beyond_all_is_refused(
-    value: int, name: str, good: Path, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("value", ["1e999", str(10**400), str(10**19), str(-(10**30))])
+def test_a_study_with_a_number_beyond_all_is_refused(value: str, good: Path, tmp_path: Path) -> None:
     shutil.copytree(good / "study", tmp_path / "study")
-    in_json(tmp_path / "study" / name, importances={"agent.gamma": value}, about={"objective": {"n": value}})
-    telling = tuned if name == "study.json" else claimed
-    with pytest.raises(InputError, match=f"{name}: is not JSON, .* is too large a number"):
-        telling(tmp_path)
-    text = (tmp_path / "study" / name).read_text()
-    (tmp_path / "study" / name).write_text(text.replace(str(value), "1e999"))
-    with pytest.raises(InputError, match=f"{name}: is not JSON, .*1e999 is too large a number"):
-        telling(tmp_path)
+    for name, telling in (("study.json", tuned), ("search.json", claimed)):
+        in_json(tmp_path / "study" / name, importances={"agent.gamma": 7531}, about={"objective": 7531})
+        text = (tmp_path / "study" / name).read_text()
+        (tmp_path / "study" / name).write_text(text.replace("7531", value))
+        with pytest.raises(InputError, match=f"{name}: is not JSON, .* is too large"):
+            telling(tmp_path)

@@ -12,7 +12,7 @@ import pytest
 from helpers.hostile import manifest, seal, weights
 from helpers.own_class import OWN_CLASS, any_class
 from helpers.resuming import go_on, stopped_after
-from helpers.support import DEEP, ROOT, SHORT, script, train_in
+from helpers.support import ROOT, SHORT, script, train_in
 
 from gridworld.commands import reproduce as command
 from gridworld.commands.reproduce import main
@@ -43,10 +43,11 @@ def reproduce(run: Path, capsys: pytest.CaptureFixture[str], *words: str, code: 
     return capsys.readouterr().out
 
 
-@pytest.mark.parametrize("agent", [*SHORT, *(f"{agent} stock" for agent in DEEP)])
-def test_every_agent_comes_to_the_same_bits(
+@pytest.mark.parametrize("agent", ["ppo", "dqn stock", "q_learning", "value_iteration"])
+def test_an_agent_comes_to_the_same_bits(
     agent: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """That each does is shown by test_resume.py, which compares a run with one that was interrupted."""
     name, _, engine = agent.partition(" ")
     train_in(tmp_path / "run", *SHORT[name], *PLAIN, *([f"agent.engine={engine}"] if engine else []))
     before = sorted(path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir())
@@ -113,12 +114,6 @@ def test_the_first_point_of_difference_is_told(copy: Path, capsys: pytest.Captur
     assert shown.splitlines()[-1] == "different"
 
 
-def test_a_curve_that_ends_earlier(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = (copy / "curve.csv").read_text().splitlines(keepends=True)
-    seal(copy, "curve.csv", "".join(lines[:-1]).encode())
-    assert "first at step 2048, step: nothing then, 2048 now" in reproduce(copy, capsys, code=1)
-
-
 def test_what_differs_in_the_environment_is_told(
     copy: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,19 +134,19 @@ def test_what_differs_in_the_environment_is_told(
     assert "    torch: 1.0 then, " in shown
     assert "    processor torch: MMX then, " in shown
     assert "    ATEN_CPU_CAPABILITY: \\x1b[2Javx2 then, none now" in shown
-    assert "    went on after step 512: numpy 1 is now 2\\x1b[2J (anyway=true)\n" in shown
-    assert "    went on after step 512: commit: abc then, later now\n" in shown
+    assert "    resumed after step 512: numpy 1 is now 2\\x1b[2J (anyway=true)\n" in shown
+    assert "    resumed after step 512: commit: abc then, later now\n" in shown
     assert "600" not in shown
     assert not list(differences(describe(), describe()))
 
 
-@pytest.mark.parametrize("agent", ["dqn", "q_learning"])
-def test_a_run_that_was_made_longer_is_made_longer_again(
-    agent: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_run_that_was_interrupted_and_made_longer_is_made_longer_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Twice: exploration jumps up again at each new length, as it does in no run of one length."""
     folder = tmp_path / "run"
-    train_in(folder, *SHORT[agent], *PLAIN, "total_timesteps=1000")
+    stopped_after(1, folder, *SHORT["dqn"], *PLAIN, "total_timesteps=1000", "checkpoint.every=600")
+    go_on(folder)
     go_on(folder, 1500)
     go_on(folder, 2500)
     shown = reproduce(folder, capsys)
@@ -159,22 +154,14 @@ def test_a_run_that_was_made_longer_is_made_longer_again(
     assert verdicts(shown) == dict.fromkeys(PARTS, "identical") | {"environment": "the same"}
 
 
-def test_a_run_that_was_merely_interrupted_is_identical(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    stopped_after(1, tmp_path / "run", *SHORT["dqn"], *PLAIN, "checkpoint.every=600")
-    go_on(tmp_path / "run")
-    assert reproduce(tmp_path / "run", capsys).endswith("identical\n")
-
-
 @pytest.mark.parametrize(
     ("again", "told"),
     [
         (
             {"step": 1200, "instead_of": 2000},
-            "it got another length after 1,200 of 2,000 steps, before its end",
+            "its length was changed after 1,200 of 2,000 steps, before its end",
         ),
-        ({"step": 2000}, "made longer, and its manifest does not say from what length"),
+        ({"step": 2000}, "made longer, but its manifest does not say from what length"),
         ({"step": 9000, "instead_of": 9000}, "the lengths .* must grow"),
     ],
     ids=["unfinished", "unknown", "shrinking"],
@@ -198,7 +185,7 @@ def test_a_run_is_kept_where_it_is_asked_for(
         path.name for path in run.iterdir() if "tfevents" not in path.name
     }
     assert (kept / "policy.png").read_bytes() == (run / "policy.png").read_bytes()
-    with pytest.raises(InputError, match="holds a run already"):
+    with pytest.raises(InputError, match="contains a run already"):
         reproduce(run, capsys, "--keep", str(kept))
     with pytest.raises(InputError, match=r"--keep=\.\./x: leads out of the current folder"):
         reproduce(run, capsys, "--keep", "../x")
@@ -218,7 +205,7 @@ def test_a_run_that_cannot_be_repeated_is_no_other_result(
 
 def test_without_its_event_file_no_run_is_identical(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     next(copy.glob("events*")).unlink()
-    with pytest.raises(InputError, match="but not all of the run is there"):
+    with pytest.raises(InputError, match="but files of the run are missing"):
         reproduce(copy, capsys)
     found = verdicts(capsys.readouterr().out)
     assert found == dict.fromkeys(PARTS, "identical") | {
@@ -227,9 +214,7 @@ def test_without_its_event_file_no_run_is_identical(copy: Path, capsys: pytest.C
     }
 
 
-@pytest.mark.parametrize(
-    "name", ["curve.csv", "model.zip", "best_model.zip", "visits.npy", "summary.json", "events*"]
-)
+@pytest.mark.parametrize("name", ["curve.csv", "best_model.zip", "events*"])
 def test_damage_is_told_before_training(name: str, copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (file,) = copy.glob(name)
     file.write_bytes(file.read_bytes()[:-3])
@@ -294,17 +279,11 @@ def test_changes_since_the_commit_are_kept_and_can_be_applied(tmp_path: Path) ->
     assert source_of(tmp_path) is None
 
 
-@pytest.mark.parametrize("damage", ["cut", "flipped", "length"])
-def test_a_damaged_event_file_is_named(damage: str, run: Path, tmp_path: Path) -> None:
+def test_a_damaged_event_file_is_named(run: Path, tmp_path: Path) -> None:
     (file,) = run.glob("events*")
-    raw = bytearray(file.read_bytes())
+    raw = file.read_bytes()
     assert len(list(read_scalars(file))) > 50
-    if damage == "cut":
-        raw = raw[:-3]
-    elif damage == "flipped":
-        raw[len(raw) // 2] ^= 1
-    else:
-        raw[:8] = b"\xff" * 8
-    (tmp_path / "events").write_bytes(raw)
-    with pytest.raises(InputError, match=r"events: is damaged or cut off after [\d,]+ bytes"):
-        list(read_scalars(tmp_path / "events"))
+    for wrong in (raw[:-3], raw[:5000] + bytes([raw[5000] ^ 1]) + raw[5001:], b"\xff" * 8 + raw[8:]):
+        (tmp_path / "events").write_bytes(wrong)
+        with pytest.raises(InputError, match=r"events: is damaged or cut off after [\d,]+ bytes"):
+            list(read_scalars(tmp_path / "events"))

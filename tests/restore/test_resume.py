@@ -1,11 +1,41 @@
-"""A run that was stopped anywhere goes on and ends as if nothing had happened, to the last bit."""
+"""A run that was stopped or killed anywhere goes on and ends as if nothing had happened, to the last bit.
 
+More kills: GRIDWORLD_RUN_KILLS=1000 GRIDWORLD_POINT_KILLS=3 python -m pytest tests/restore/test_resume.py
+"""
+
+import gc
+import os
+import random
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
-from helpers.resuming import Crash, begin, crash_after, differences, go_on, left_behind, stopped_after
+from helpers.resuming import (
+    at_call,
+    begin,
+    begin_or_go_on,
+    crashing_after,
+    differences,
+    go_on,
+    left_behind,
+    stopped_after,
+)
 from helpers.support import SHORT
 
+from gridworld.run import checkpoints as checkpoint
+from gridworld.run.checkpoints import Checkpoints
+from gridworld.storage import atomic_write as files
+from gridworld.storage.atomic_write import AppendLog
+from gridworld.training import session
+from gridworld.training.pictures import Pictures
+
+KILLS = int(os.environ.get("GRIDWORLD_RUN_KILLS", "10"))
+ROUNDS = int(os.environ.get("GRIDWORLD_POINT_KILLS", "1"))
 CASES = {
     "dqn": [*SHORT["dqn"], "agent.learning_rate=lin_0.003"],
     **{
@@ -17,11 +47,12 @@ CASES = {
     },
     "dqn stock": [
         *(*SHORT["dqn"], "agent.engine=stock", "n_envs=8"),
-        *("agent.buffer_size=2000", "agent.gradient_steps=4"),
+        *("agent.buffer_size=1000", "agent.gradient_steps=2", "total_timesteps=1200"),
     ],
     "dqn stock that stores an observation once": [
         *(*SHORT["dqn"], "agent.engine=stock", "n_envs=8", "agent.optimize_memory_usage=true"),
-        *("+agent.replay_buffer_kwargs.handle_timeout_termination=false", "agent.gradient_steps=4"),
+        *("+agent.replay_buffer_kwargs.handle_timeout_termination=false", "agent.gradient_steps=1"),
+        "total_timesteps=1000",
     ],
     "ppo": [
         *SHORT["ppo"],
@@ -44,9 +75,100 @@ def test_every_agent_goes_on_to_the_bit(case: str, tmp_path: Path) -> None:
     words = [*CASES[case], *LESS]
     begin(tmp_path / "calm", *words)
     stopped_after(1, tmp_path / "run", *words, "checkpoint.every=150")
-    with pytest.MonkeyPatch.context() as patched:
-        crash_after(patched, 2)
-        with pytest.raises(Crash):
-            go_on(tmp_path / "run")
+    with crashing_after(2):
+        go_on(tmp_path / "run")
     go_on(tmp_path / "run")
     assert differences(left_behind(tmp_path / "run"), left_behind(tmp_path / "calm")) == []
+
+
+SAVED = ["recording.frames=false", "recording.gif=false", "logging.progress=false", "checkpoint.every=100"]
+RUNS = {name: [*CASES[name], *SAVED] for name in ("dqn", "dqn stock", "ppo", "trpo stock", "q_learning")}
+
+
+def in_a_process(work: Callable[[], None], seconds: float | None = None) -> int:
+    """What became of a process of its own, killed after so long: 0 it ended well, below 0 it was killed."""
+    process = os.fork()
+    if process == 0:
+        try:
+            gc.disable()
+            with open(os.devnull, "w") as nowhere:
+                sys.stderr = nowhere
+                work()
+            os._exit(0)
+        except BaseException:
+            import traceback
+
+            traceback.print_exc(file=sys.__stderr__)
+            os._exit(1)
+    if seconds is not None:
+        time.sleep(seconds)
+        os.kill(process, signal.SIGKILL)
+    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+
+
+def is_done(folder: Path) -> bool:
+    manifest = folder / "manifest.json"
+    return manifest.exists() and '"status": "finished"' in manifest.read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RUNS)
+def test_a_run_that_is_killed_ends_as_if_it_was_not(name: str, tmp_path: Path) -> None:
+    words, folder = RUNS[name], tmp_path / "run"
+    started = time.monotonic()
+    begin(tmp_path / "calm", *words)
+    longest = min(time.monotonic() - started, 1.0)  # the first one imports, too
+    calm = left_behind(tmp_path / "calm")
+    chance, wanted = random.Random(name), -(-KILLS // len(RUNS))
+    kills = 0
+    while kills < wanted:
+        code = in_a_process(lambda: begin_or_go_on(folder, *words), chance.uniform(0, 1.2 * longest))
+        assert code in (0, -signal.SIGKILL)
+        kills += code != 0
+        if is_done(folder):
+            assert differences(left_behind(folder), calm) == []
+            shutil.rmtree(folder)
+    if folder.exists():
+        assert in_a_process(lambda: begin_or_go_on(folder, *words)) == 0
+        assert differences(left_behind(folder), calm) == []
+        assert list(folder.rglob(".*.part")) == []
+
+
+def kill() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+# Where to die: before or after this function's n-th call.
+POINTS: list[tuple[Any, str, bool, int]] = [
+    (AppendLog, "append", False, 9),
+    (AppendLog, "append", True, 12),
+    (AppendLog, "sync", True, 3),
+    (checkpoint, "encode", False, 2),
+    (files.os, "replace", False, 5),
+    (files.os, "fsync", True, 7),
+    (files, "sync_folder", False, 3),
+    (Checkpoints, "keep", False, 4),
+    (session, "write_bytes", True, 1),
+    (session, "write_json", False, 1),
+    (Pictures, "finish", False, 1),
+]
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_at_a_point_ends_as_if_it_was_not(tmp_path: Path) -> None:
+    words = RUNS["dqn"]
+    begin(tmp_path / "calm", *words)
+    calm = left_behind(tmp_path / "calm")
+    folder = tmp_path / "run"
+    for turn in range(ROUNDS):
+        for owner, name, after, number in POINTS:
+            at = max(1, number - turn)  # an earlier call in every round; later ones need not come
+
+            def die(owner: Any = owner, name: str = name, after: bool = after, at: int = at) -> None:
+                setattr(owner, name, at_call(at, kill, getattr(owner, name), after))
+                begin_or_go_on(folder, *words)
+
+            assert in_a_process(die) == -signal.SIGKILL, name
+            assert in_a_process(lambda: begin_or_go_on(folder, *words)) == 0, name
+            assert differences(left_behind(folder), calm) == [], name
+            shutil.rmtree(folder)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from helpers.resuming import begin, differences, go_on, left_behind, stopped_after
-from helpers.support import ROOT, SHORT, configure, script, start
+from helpers.support import ROOT, SHORT, script, start, wait_for
 
 from gridworld.commands.train import resume
 from gridworld.errors import InputError
@@ -21,11 +21,8 @@ from gridworld.run import provenance
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.folder import LOCK, RunFolder
 from gridworld.run.provenance import Source
-from gridworld.storage.atomic_write import AppendLog, locked, write_json
-from gridworld.storage.safe_read import sealed
+from gridworld.storage.atomic_write import AppendLog, locked
 from gridworld.storage.serialization import decode, encode
-from gridworld.sweep.job import run_in_sweep
-from gridworld.training.together import run_alone
 
 LESS = ["recording.frames=false", "recording.gif=false"]
 WORDS = [*SHORT["q_learning"], *LESS, "checkpoint.every=600"]
@@ -63,12 +60,14 @@ def test_resume_and_the_same_command_again(stopped: Path, calm: dict[str, object
     cwd = stopped.parent
     done = script("train.py", "resume=run", "logging.progress=false", cwd=cwd)
     assert done.returncode == 0, done.stderr
-    assert "run: goes on after 1,200 of 2,000 steps" in done.stderr
+    assert "run: resumes after 1,200 of 2,000 steps" in done.stderr
     assert "q_learning on classic, seed 0: 2,000 steps" in done.stdout
     assert differences(left_behind(stopped), calm) == []
 
+    before = left_there(cwd / "other")
     refused = script("train.py", *WORDS, "hydra.run.dir=other", "seed=3", "env.slip=0.2", cwd=cwd)
     assert refused.returncode == 2
+    assert left_there(cwd / "other") == {**before, ".lock": b""}
     expected = "unfinished run with other settings (seed=3 instead of 0, env.slip=0.2 instead of 0.0); choose"
     assert expected in refused.stderr
     again = script("train.py", *WORDS, "hydra.run.dir=other", cwd=cwd)
@@ -76,7 +75,9 @@ def test_resume_and_the_same_command_again(stopped: Path, calm: dict[str, object
     assert differences(left_behind(cwd / "other"), calm) == []
     third = script("train.py", *WORDS, "hydra.run.dir=other", cwd=cwd)
     assert third.returncode == 2
-    assert "other: holds a run already; choose another folder, or make that run longer by" in third.stderr
+    assert (
+        "other: contains a run already; choose another folder, or make that run longer with" in third.stderr
+    )
 
 
 @pytest.mark.parametrize(
@@ -85,11 +86,11 @@ def test_resume_and_the_same_command_again(stopped: Path, calm: dict[str, object
         (["resume="], "resume=: must be the folder of a run"),
         (["resume=nowhere"], "nowhere: no such folder"),
         (["resume=.."], "resume=..: leads out of the current folder"),
-        (["resume=run", "seed=1"], "seed=1: a run goes on with the settings that it began with; beside"),
-        (["-m", "resume=run"], "-m: a run goes on with the settings"),
+        (["resume=run", "seed=1"], "seed=1: a run is resumed with its own settings; besides"),
+        (["-m", "resume=run"], "-m: a run is resumed with its own settings"),
         (["resume=run", "total_timesteps=1.5"], "total_timesteps=1.5: must be a number of environment steps"),
-        (["resume=run", "total_timesteps=1000"], "has come to 1,200 of 2,000 steps; it can be made longer"),
-        (["resume=run", "resume=other"], "resume=other: resume is given already; give it once"),
+        (["resume=run", "total_timesteps=1000"], "has done 1,200 of 2,000 steps; it can be made longer"),
+        (["resume=run", "resume=other"], "resume=other: resume is given twice; give it once"),
         (["resume=run", "anyway=maybe"], "anyway=maybe: must be true or false"),
     ],
     ids=lambda value: str(value)[:40],
@@ -105,26 +106,14 @@ def test_mistakes(words: list[str], expected: str, killed: Path, monkeypatch: py
 def test_a_run_is_one_process_alone(stopped: Path) -> None:
     """Also before there is a manifest."""
     (stopped.with_name("begun") / ".hydra").mkdir(parents=True)
-    for name, words in (
-        ("run", ["resume=run"]),
-        ("run", [*WORDS, "hydra.run.dir=run"]),
-        ("begun", [*WORDS, "hydra.run.dir=begun"]),
-    ):
+    for name, words in (("run", ["resume=run"]), ("begun", [*WORDS, "hydra.run.dir=begun"])):
         folder = stopped.with_name(name)
         with locked(folder / LOCK, wait=0):
             before = left_there(folder)
             done = script("train.py", *words, cwd=stopped.parent)
             assert done.returncode == 2
-            assert f"{name}: another process is at work in it" in done.stderr
+            assert f"{name}: another process is using it" in done.stderr
             assert left_there(folder) == before
-
-
-def test_a_refused_start_leaves_the_configuration_of_the_run(stopped: Path) -> None:
-    before = left_there(stopped)
-    done = script("train.py", *WORDS, "hydra.run.dir=run", "seed=77", cwd=stopped.parent)
-    assert done.returncode == 2
-    assert "unfinished run with other settings (seed=77 instead of 0)" in done.stderr
-    assert left_there(stopped) == {**before, ".lock": b""}
 
 
 def left_there(folder: Path) -> dict[str, bytes]:
@@ -148,33 +137,33 @@ def test_what_a_killed_process_had_half_written_is_taken_away(tmp_path: Path) ->
     assert [path.name for path in folder.rglob("*.part")] == [".notes.part"]
 
 
-def test_a_finished_run_is_made_longer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Without settings that fall over training, it is the run that would have been so long from the start."""
-    words = [*SHORT["ppo"], *LESS, "evaluation.every=700"]
-    begin(tmp_path / "long", *words, "total_timesteps=4000")
-    begin(tmp_path / "run", *words)
-    with pytest.raises(InputError, match=r"is finished; to make it longer, say how long: .*=4000"):
-        go_on(tmp_path / "run")
-    go_on(tmp_path / "run", 4000)
-    assert capsys.readouterr().err.endswith(": 4,000 steps instead of 2,000\n")
-    shorter = left_behind(tmp_path / "run")
-    assert differences(shorter, left_behind(tmp_path / "long")) == []
+def test_a_finished_run_is_made_longer_on_request_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begin(tmp_path, *WORDS)
+    with pytest.raises(InputError, match=r"is finished; to make it longer: .*=4000"):
+        go_on(tmp_path)
+    go_on(tmp_path, 4000)
+    assert ": 4,000 steps instead of 2,000" in capsys.readouterr().err
     with pytest.raises(InputError, match="it can be made longer, not shorter"):
-        go_on(tmp_path / "run", 3000)
+        go_on(tmp_path, 3000)
 
 
 @pytest.mark.parametrize(
     ("words", "total", "longer"),
     [
         (["agent=q_learning", "n_envs=16", "evaluation.every=220"], 1760, 4000),  # due at the last step
+        ([*SHORT["ppo"], "evaluation.every=700"], 2000, 4000),
         ([*SHORT["ppo"], "evaluation.every=128"], 600, 2000),  # due thrice between 600 and 1,024, the last
         (["agent=a2c", "agent.arguments.learning_rate=0.005", "n_envs=4", "evaluation.every=100"], 484, 1000),
         ([*SHORT["dqn"], "n_envs=32", "agent.exploration_fraction=1e-9", "evaluation.every=500"], 1001, 1500),
     ],
-    ids=["q_learning", "ppo", "a2c", "dqn"],
+    ids=["q_learning", "ppo", "due thrice", "a2c", "dqn"],
 )
-def test_the_curve_of_a_run_made_longer(words: list[str], total: int, longer: int, tmp_path: Path) -> None:
-    """An evaluation that is due where the shorter run ends is where it is in the longer one."""
+def test_a_run_made_longer_is_the_one_of_that_length(
+    words: list[str], total: int, longer: int, tmp_path: Path
+) -> None:
+    """Without settings that fall over training; also where an evaluation is due at the shorter one's end."""
     words = [*words, *LESS]
     begin(tmp_path / "long", *words, f"total_timesteps={longer}", "logging.policy_map_every=2")
     begin(tmp_path / "run", *words, f"total_timesteps={total}", "logging.policy_map_every=2")
@@ -185,8 +174,10 @@ def test_the_curve_of_a_run_made_longer(words: list[str], total: int, longer: in
     assert differences(one, other) == []
 
 
-@pytest.mark.parametrize("total", [1000, 4000])
-@pytest.mark.parametrize("harm", ["empty", "another format", "no format", "other columns"])
+@pytest.mark.parametrize(
+    ("harm", "total"),
+    [("empty", 1000), ("another format", 4000), ("no format", 4000), ("other columns", 4000)],
+)
 def test_a_finished_run_without_a_checkpoint_that_fits_is_kept(harm: str, total: int, tmp_path: Path) -> None:
     begin(tmp_path / "run", *WORDS)
     for file in Checkpoints(tmp_path / "run").files():
@@ -203,7 +194,7 @@ def test_a_finished_run_without_a_checkpoint_that_fits_is_kept(harm: str, total:
             curve.close()
         file.write_bytes(b"" if harm == "empty" else encode(state))
     before = left_there(tmp_path / "run")
-    with pytest.raises(InputError, match=r"is finished, and checkpoints/ has no checkpoint .* a new run in"):
+    with pytest.raises(InputError, match=r"is finished, but checkpoints/ has no checkpoint .*a new run of"):
         go_on(tmp_path / "run", total)
     assert left_there(tmp_path / "run") == before
 
@@ -238,7 +229,7 @@ def test_another_environment_is_refused_or_noted(
 ) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(provenance, name, lambda: now)
-        with pytest.raises(InputError, match=rf"begun in another environment \({told}\).*anyway=true"):
+        with pytest.raises(InputError, match=rf"started in another environment \({told}\).*anyway=true"):
             go_on(stopped)
         open_unfinished(stopped).resume(anyway=True)
     (again,) = manifest(stopped)["resumed"]  # type: ignore[misc, attr-defined]
@@ -253,57 +244,58 @@ def test_another_commit_is_told_and_noted(
     monkeypatch.setattr(provenance, "source", lambda: Source("abc", b"some changes"))
     go_on(stopped)
     told = capsys.readouterr().err
-    assert "run: the source tree is another, which is noted: commit: " in told
+    assert "run: the source code has changed, as its manifest will say:  commit: " in told
     assert " then, abc now; uncommitted source: " in told
     (again,) = manifest(stopped)["resumed"]  # type: ignore[misc, attr-defined]
     assert again["git"]["commit"] == "abc"
     assert (stopped / again["git"]["diff"]["file"]).read_bytes() == b"some changes"
     go_on(stopped, 3000)
     assert "git" not in manifest(stopped)["resumed"][1]  # type: ignore[index]
-    assert "the source tree" not in capsys.readouterr().err
+    assert "the source code" not in capsys.readouterr().err
 
 
-def test_a_map_that_changed_meanwhile(tmp_path: Path) -> None:
+def test_a_map_that_changed_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     world = tmp_path / "world.txt"
     world.write_text("S..\n..G\n")
     words = [*WORDS, "env.layout=world.txt", "hydra.run.dir=run"]
-    killed = script(str(ROOT / "tests" / "helpers" / "dying.py"), "1", *words, cwd=tmp_path)
-    assert killed.returncode == -signal.SIGKILL
-    assert manifest(tmp_path / "run")["status"] == "running"
+    stopped_after(1, tmp_path / "run", *words[:-1])
     world.write_text("S..\nT.G\n")
     refused = script("train.py", *words, cwd=tmp_path)
     assert refused.returncode == 2
-    assert "the world world.txt has changed since" in refused.stderr
+    assert "(the world world.txt has changed); choose another" in refused.stderr
     done = script("train.py", "resume=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert (
-        "its world world.txt has changed since; it continues with the one that it began with" in done.stderr
-    )
+    assert "its world world.txt has changed; the run continues with its original world" in done.stderr
     assert manifest(tmp_path / "run")["layout"] == ["S..", "..G"]
 
 
-def told_after(number: signal.Signals, folder: Path, *words: str, times: int = 1) -> str:
-    """What a run says that gets a signal in the middle, or several."""
-    with start("train.py", *words, "hydra.run.dir=run", cwd=folder) as process:
-        curve, deadline = folder / "run" / "curve.csv", time.monotonic() + 180
-        while not (curve.exists() and curve.read_text().count("\n") > 2) and time.monotonic() < deadline:
-            time.sleep(0.05)
+@pytest.mark.parametrize(
+    ("number", "times", "rollout", "told"),
+    [
+        (signal.SIGINT, 1, 32, "stopped by SIGINT: all {:,} steps are saved; resume with"),
+        (signal.SIGTERM, 1, 32, "stopped by SIGTERM: all {:,} steps are saved; resume with"),
+        # A rollout of many seconds cannot be saved in its middle: the first signal waits for its end.
+        (signal.SIGTERM, 2, 30000, "stopped by SIGTERM: nothing is saved, so it will start over; resume"),
+    ],
+    ids=["ctrl-c", "terminated", "twice"],
+)
+def test_a_signal_saves_and_ends_soon(
+    number: signal.Signals, times: int, rollout: int, told: str, tmp_path: Path
+) -> None:
+    words = ("agent=a2c", f"agent.arguments.n_steps={rollout}", "total_timesteps=100000000")
+    curve = tmp_path / "run" / "curve.csv"
+    with start("train.py", *words, "evaluation.every=1000", "hydra.run.dir=run", cwd=tmp_path) as process:
+        wait_for(lambda: curve.exists() and curve.read_text().count("\n") > 2, "its curve", process)
         for _ in range(times):
             process.send_signal(number)
             time.sleep(0.1)
-        _, told = process.communicate(timeout=180)
+        _, printed = process.communicate(timeout=180)
     assert process.returncode == 128 + number
-    return str(told)
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_and_ends_soon(number: signal.Signals, tmp_path: Path) -> None:
-    short = ("n_envs=16", "agent.n_steps=32", "agent.batch_size=64")  # rollouts: one ends within a second
-    told = told_after(number, tmp_path, "agent=ppo", *short, "total_timesteps=100000000")
     left = manifest(tmp_path / "run")
     assert left["status"] == "interrupted"
-    assert left["checkpoint"] == left["reached"] > 0  # type: ignore[operator]
-    assert f"stopped by {number.name}: all {left['reached']:,} steps are saved; go on with" in told
+    assert told.format(left["reached"]) in printed
+    assert times == 2 or left["checkpoint"] == left["reached"] > 0  # type: ignore[operator]
     assert list((tmp_path / "run").rglob("*.part")) == []
 
 
@@ -346,24 +338,6 @@ def test_scripts_listen_before_what_takes_time_to_import() -> None:
         code = [line for line in path.read_text().splitlines()[1:] if line]
         assert code[0] == "from gridworld.process.signals import listen"
         assert code[2] == "    listen()  # before what takes time to import"
-
-
-def test_a_second_signal_ends_a_run_that_cannot_be_saved_yet(tmp_path: Path) -> None:
-    """A rollout of many seconds cannot be saved in its middle: the first signal waits for its end."""
-    words = ("agent=a2c", "agent.arguments.n_steps=30000", "total_timesteps=100000000")
-    told = told_after(signal.SIGTERM, tmp_path, *words, "evaluation.every=1000", times=2)
-    assert "stopped by SIGTERM: nothing is saved, so that it will begin anew; go on with" in told
-
-
-def test_an_interrupted_job_of_a_sweep_goes_on(tmp_path: Path) -> None:
-    words = [*WORDS, "seed=1"]
-    begin(tmp_path / "calm", *words)
-    folder = tmp_path / "sweep" / "seed=1"
-    stopped_after(2, folder, *words)
-    write_json(folder / "manifest.json", sealed({**manifest(folder), "status": "running"}))
-    run_alone(run_in_sweep(configure(*words), folder, words, stop_at_failure=False))
-    assert manifest(folder)["resumed"]
-    assert differences(left_behind(folder), left_behind(tmp_path / "calm")) == []
 
 
 @pytest.mark.parametrize(

@@ -5,12 +5,13 @@ import os
 import random
 import shutil
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.resuming import begin, differences, go_on, left_behind, stopped_after
+from helpers.hostile import damaged
+from helpers.resuming import at_call, begin, differences, go_on, left_behind, stopped_after
 from helpers.support import ROOT, SHORT, script, train_on_full_disk
 
 from gridworld.engine.dqn import DQN
@@ -61,42 +62,30 @@ def test_the_last_good_state_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert differences(left_behind(tmp_path / "run"), left_behind(tmp_path / "calm")) == []
 
 
-@pytest.mark.parametrize("name", ["events.out.tfevents.*", "curve.csv", ""])
+@pytest.mark.parametrize("name", ["events.out.tfevents.*", "curve.csv"])
 def test_a_file_deleted_under_us_is_told(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save, run = Checkpoints.save, tmp_path / "run"
 
     def deleting(self: Checkpoints, *arguments: Any, **options: Any) -> None:
         save(self, *arguments, **options)
-        for path in run.glob(name) if name else [run]:
-            path.unlink() if path.is_file() else shutil.rmtree(path)
+        for path in run.glob(name):
+            path.unlink()
 
     monkeypatch.setattr(Checkpoints, "save", deleting)
     with pytest.raises(InputError, match="was deleted or replaced during the run"):
         begin(run, *WORDS)
 
 
-def failing(original: Callable[..., Any], number: int, code: int) -> Callable[..., Any]:
-    calls = 0
-
-    def fails(*arguments: Any, **options: Any) -> Any:
-        nonlocal calls
-        calls += 1
-        if calls >= number:
-            raise OSError(code, os.strerror(code))
-        return original(*arguments, **options)
-
-    return fails
+def fail(code: int) -> None:
+    raise OSError(code, os.strerror(code))
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EIO])
 def test_a_curve_that_cannot_be_written_ends_the_run(
-    code: int, calm: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    calm: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
-        patched.setattr(AppendLog, "append", failing(AppendLog.append, 30, code))
-        with pytest.raises(
-            InputError, match=rf"{os.strerror(code)}; put that right, then go on with .*resume="
-        ):
+        patched.setattr(AppendLog, "append", at_call(30, partial(fail, errno.EIO), AppendLog.append))
+        with pytest.raises(InputError, match=r"Input/output error; fix that, .* with .*resume="):
             begin(tmp_path, *WORDS)
     go_on(tmp_path)
     assert differences(left_behind(tmp_path), calm) == []
@@ -105,7 +94,7 @@ def test_a_curve_that_cannot_be_written_ends_the_run(
 def test_without_room_for_checkpoints_it_goes_on(
     calm: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any
 ) -> None:
-    monkeypatch.setattr(checkpoint, "encode", failing(checkpoint.encode, 2, errno.ENOSPC))
+    monkeypatch.setattr(checkpoint, "encode", at_call(2, partial(fail, errno.ENOSPC), checkpoint.encode))
     begin(tmp_path, *WORDS)
     assert "no checkpoint after step 800, No space left on device" in caplog.text
     assert differences({**left_behind(tmp_path), "state": None}, {**calm, "state": None}) == []
@@ -116,7 +105,7 @@ def test_a_really_full_disk(tmp_path: Path, calm: dict[str, Any]) -> None:
     done = train_on_full_disk(15_000, *WORDS, "hydra.run.dir=run", cwd=tmp_path)
     assert done.returncode == 2
     assert (
-        f"error: run: File too large; put that right, then go on with python {ROOT}/scripts/train.py"
+        f"error: run: File too large; fix that, then resume with python {ROOT}/scripts/train.py"
         in done.stderr
     )
     again = script("train.py", "resume=run", cwd=tmp_path)
@@ -126,17 +115,10 @@ def test_a_really_full_disk(tmp_path: Path, calm: dict[str, Any]) -> None:
 
 def test_no_room_for_the_manifest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched:
-        patched.setattr(run, "write_json", failing(run.write_json, 1, errno.ENOSPC))
-        with pytest.raises(InputError, match=r"run: No space left on device; .* give the command again$"):
+        patched.setattr(run, "write_json", at_call(1, partial(fail, errno.ENOSPC), run.write_json))
+        with pytest.raises(InputError, match=r"run: No space left on device; .* run the command again$"):
             begin(tmp_path / "run", *WORDS)
     begin(tmp_path / "run", *WORDS)
-
-
-def test_what_was_changed_in_the_source_is_that_of_the_run(tmp_path: Path) -> None:
-    begin(tmp_path, *WORDS)
-    (tmp_path / "source.diff").write_text("of another time")
-    run.clear(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"manifest.json"}
 
 
 def test_frames_that_are_a_link_are_replaced(tmp_path: Path) -> None:
@@ -159,41 +141,20 @@ def test_a_clock_that_jumps(calm: dict[str, Any], tmp_path: Path, monkeypatch: p
     begin(tmp_path / "dqn", *SHORT["dqn"], *LESS)
 
 
-def damage(folder: Path, number: int) -> str:
-    """Do one of the things that happen to folders; returns what it was."""
-    chance = random.Random(number)
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    path = files[number % len(files)]
-    content = path.read_bytes()
-    at = chance.randrange(len(content))
-    kind = ("deleted", "cut", "flipped", "emptied", "longer", "other")[number // len(files) % 6]
-    if kind == "deleted":
-        path.unlink()
-    else:
-        path.write_bytes(
-            {
-                "cut": content[:at],
-                "flipped": content[:at] + bytes([content[at] ^ 1 << chance.randrange(8)]) + content[at + 1 :],
-                "emptied": b"",
-                "longer": content + chance.randbytes(100),
-                "other": chance.randbytes(len(content)),
-            }[kind]
-        )
-    return f"{path.name} {kind}"
-
-
 def test_a_damaged_folder_ends_the_same_or_is_refused(calm: dict[str, Any], tmp_path: Path) -> None:
     stopped_after(3, tmp_path / "whole", *WORDS)
-    refused = []
+    names = sorted(path.relative_to(tmp_path) for path in (tmp_path / "whole").rglob("*") if path.is_file())
     for number in range(DAMAGES):
-        folder = tmp_path / "run"
-        shutil.copytree(tmp_path / "whole", folder)
-        what = damage(folder, number * (5 if DAMAGES < 30 else 1))
+        shutil.copytree(tmp_path / "whole", tmp_path / "run")
+        name, chance = names[number % len(names)].relative_to("whole"), random.Random(number)
+        content = damaged(chance, (tmp_path / "run" / name).read_bytes())
+        (tmp_path / "run" / name).unlink()
+        if chance.random() < 0.8:
+            (tmp_path / "run" / name).write_bytes(content)
         try:
-            go_on(folder)
+            go_on(tmp_path / "run")
         except InputError:
-            refused.append(what)
+            assert name.name == "manifest.json", (number, name)
         else:
-            assert differences(left_behind(folder), calm) == [], what
-        shutil.rmtree(folder)
-    assert all("manifest.json" in what for what in refused), refused
+            assert differences(left_behind(tmp_path / "run"), calm) == [], (number, name)
+        shutil.rmtree(tmp_path / "run")

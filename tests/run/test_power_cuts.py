@@ -21,7 +21,7 @@ from gridworld.sweep.job import run_in_sweep
 from gridworld.sweep.plan import plan
 from gridworld.training.together import run_alone
 
-CUTS = int(os.environ.get("GRIDWORLD_POWER_CUTS", "8"))
+CUTS = int(os.environ.get("GRIDWORLD_POWER_CUTS", "6"))
 LESS = ["recording.frames=false", "recording.gif=false", "recording.learning=false", "logging.progress=false"]
 WORDS = [*SHORT["q_learning"], *LESS]
 SAVED = [*WORDS, "checkpoint.every=600"]
@@ -34,7 +34,7 @@ def cuts_of(root: Path, work: Callable[[], None]) -> list[Left]:
         disk = Disk(root, patched)
         work()
     disk.close()
-    return [*disk.cuts[:: max(1, len(disk.cuts) // CUTS)], *disk.cuts[-6:]]
+    return [*disk.cuts[:: max(1, len(disk.cuts) // CUTS)], *disk.cuts[-4:]]
 
 
 def is_whole(folder: Path) -> bool:

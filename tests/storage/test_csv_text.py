@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import gridworld
 from gridworld.process.console import plain
 from gridworld.report.tables import Table, to_csv
 from gridworld.storage.safe_read import csv_rows, csv_text
@@ -50,9 +49,3 @@ def test_tables_of_reports_and_of_sweeps_have_no_formulas(tmp_path: Path) -> Non
     written = (tmp_path / "jobs.csv").read_text()
     assert ",'-> it broke" in written
     assert list(csv_rows(written))[1] == list(dataclasses.astuple(row))
-
-
-def test_only_one_module_writes_csv() -> None:
-    writes = re.compile(r"csv\.(writer|DictWriter)\(")
-    package = Path(gridworld.__file__).parent
-    assert [p.name for p in package.rglob("*.py") if writes.search(p.read_text())] == ["safe_read.py"]

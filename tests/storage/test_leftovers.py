@@ -6,8 +6,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.resuming import begin
-from helpers.support import NO_FILES, SHORT
 
 from gridworld.storage.atomic_write import tidy
 
@@ -55,12 +53,3 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(name: str, tmp_pat
     living.communicate("")
     assert living.returncode == 0
     assert names(tmp_path) == sorted([".film.9.part.txt", name])
-
-
-def test_a_run_that_is_begun_again_leaves_nothing_half_written(tmp_path: Path) -> None:
-    (tmp_path / "checkpoints").mkdir()
-    writer(tmp_path, "dies", "model.zip")
-    writer(tmp_path, "dies", "frames")
-    writer(tmp_path / "checkpoints", "dies", "1.state")
-    begin(tmp_path, *SHORT["sarsa"], *NO_FILES)
-    assert not list(tmp_path.rglob("*.part"))

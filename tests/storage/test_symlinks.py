@@ -55,7 +55,7 @@ def test_confirming_takes_no_folder_away_through_a_link(link: str, tmp_path: Pat
     with pytest.raises(InputError, match=REFUSED):
         confirm.prepare(tmp_path / "study", [run])
     with pytest.raises(InputError, match=REFUSED):
-        confirm.HeldOutRuns((run,))(lambda message: None)
+        confirm.run_held_out([run])
     assert contents(victim) == before
 
 
@@ -107,14 +107,7 @@ def test_hydra_writes_nothing_through_a_link(tmp_path: Path, victim: Path) -> No
     assert contents(tmp_path) == before
 
 
-def test_a_new_run_is_not_begun_beside_checkpoints_that_lead_elsewhere(tmp_path: Path, victim: Path) -> None:
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "checkpoints").symlink_to(victim)
-    with pytest.raises(InputError, match=f"run/checkpoints: {REFUSED}"):
-        check_free(tmp_path / "run")
-
-
-def test_a_lock_that_is_a_link_is_refused(tmp_path: Path, victim: Path) -> None:
+def test_a_lock_or_checkpoints_that_are_a_link_are_refused(tmp_path: Path, victim: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / ".lock").symlink_to(victim / "trial=1,seed=0" / "model.zip")
     before = contents(victim)
@@ -122,4 +115,8 @@ def test_a_lock_that_is_a_link_is_refused(tmp_path: Path, victim: Path) -> None:
         pass
     with pytest.raises(InputError, match=r"run/\.lock: is a symbolic link"):
         is_locked(tmp_path / "run" / ".lock")
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / "checkpoints").symlink_to(victim)
+    with pytest.raises(InputError, match=f"new/checkpoints: {REFUSED}"):
+        check_free(tmp_path / "new")
     assert contents(victim) == before

@@ -7,13 +7,12 @@ import re
 import shutil
 import signal
 import subprocess
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from helpers.pages import NO_PICTURES
-from helpers.support import ROOT, script, start, train_on_full_disk
+from helpers.support import ROOT, script, start, train_on_full_disk, wait_for
 
 from gridworld.commands import jobs as jobs_command
 from gridworld.run.reader import read_run
@@ -121,19 +120,32 @@ def test_settings_are_told_by_the_words_that_asked_for_them(tmp_path: Path) -> N
     assert [row[2] for row in results(followed.stdout)] == ["n_envs=3", "n_envs=4"]
     presets = script("train.py", "-m", *QUICK, "env=four_rooms", "preset=auto,none,large", cwd=tmp_path)
     assert [row[2] for row in results(presets.stdout)] == ["preset=auto", "preset=large"]
-    assert "preset=none makes the same runs as preset=auto, and these are run once" in presets.stderr
+    assert "preset=none repeats the runs of preset=auto; they run once" in presets.stderr
 
 
-def test_a_failure_stops_no_other_job(tmp_path: Path) -> None:
-    done = sweep("agent.learning_rate=0.1,2,0.2", "seed=0,1", cwd=tmp_path)
+def test_a_failure_stops_no_other_job(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    done = sweep("agent.learning_rate=0.1,2,0.2", cwd=tmp_path)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
-    assert sorted(statuses(tmp_path / "sweep").values()) == ["done"] * 4 + ["failed"] * 2
-    assert [row[2] for row in results(done.stdout)] == ["learning_rate=0.1", "learning_rate=0.2"]
-    row = table(tmp_path / "sweep")["agent.learning_rate=2,seed=0"]
-    assert row["error"].startswith("agent.learning_rate=2: must be above 0 and at most 1")
-    assert done.stderr.count("agent.learning_rate=2: must be above 0 and at most 1") == 2
+    *counted, _ = results(done.stdout)  # the last line names the job that is not
+    assert [row[2] for row in counted] == ["learning_rate=0.1", "learning_rate=0.2"]
+    row, why = (
+        table(tmp_path / "sweep")["agent.learning_rate=2"],
+        "agent.learning_rate=2: must be above 0 and ",
+    )
+    assert row["error"].startswith(why)
+    assert done.stderr.count(why) == 2
     assert "retry_failed" not in done.stderr  # it would fail again
+    jobs_command.main([str(tmp_path / "sweep")])
+    *rows, total = capsys.readouterr().out.splitlines()
+    assert [row.split()[:2] for row in rows] == [
+        [f"agent.learning_rate={rate}", status]
+        for rate, status in ((0.1, "done"), (2, "failed"), (0.2, "done"))
+    ]
+    assert rows[1].endswith(row["error"])
+    assert total == "3 jobs: 2 done, 1 failed"
+    jobs_command.main([str(tmp_path / "sweep"), "--status", "failed"])
+    assert len(capsys.readouterr().out.splitlines()) == 2
 
 
 def test_what_fails_while_it_runs_is_told_and_tried_again_if_asked(tmp_path: Path) -> None:
@@ -154,37 +166,20 @@ def test_what_fails_while_it_runs_is_told_and_tried_again_if_asked(tmp_path: Pat
     assert "1 to run" in sweep(*words, "hydra.sweeper.retry_failed=true", cwd=tmp_path).stderr
 
 
-def with_own_classes(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """A sweep of A2C and of classes made for the occasion."""
-    (cwd / "own.py").write_text(OWN_CLASSES)
-    return script(
-        "train.py",
-        *("-m", "agent=a2c", "total_timesteps=64", "n_envs=4", "evaluation.every=64", FOLDER),
-        *NO_PICTURES,
-        *words,
-        cwd=cwd,
-        PYTHONPATH=f"{cwd}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
-    )
-
-
-def test_an_unforeseen_error_leaves_its_traceback(tmp_path: Path) -> None:
-    done = with_own_classes("agent.algorithm=own.Broken,stable_baselines3.A2C", cwd=tmp_path)
+def test_an_unforeseen_error_or_a_killed_worker_takes_no_other_job_along(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(OWN_CLASSES)
+    path = f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+    words = ["-m", "agent=a2c", "total_timesteps=64", "n_envs=4", "evaluation.every=64", *NO_PICTURES, FOLDER]
+    words += ["agent.algorithm=own.Broken,own.Killer,stable_baselines3.A2C", *WORKERS]
+    done = script("train.py", *words, cwd=tmp_path, PYTHONPATH=path)
     assert done.returncode == 1, done.stderr
-    broken, working = table(tmp_path / "sweep").values()
-    assert (broken["status"], working["status"]) == ("failed", "done")
-    assert broken["error"] == "RuntimeError: first second"
-    assert "in learn\n" in (tmp_path / "sweep" / broken["job"] / "error.txt").read_text()
     assert "Traceback" not in done.stderr
-
-
-def test_a_worker_that_is_killed_takes_no_other_job_along(tmp_path: Path) -> None:
-    words = ("agent.algorithm=own.Killer,stable_baselines3.A2C", *WORKERS)
-    done = with_own_classes(*words, cwd=tmp_path)
-    assert done.returncode == 1, done.stderr
-    rows = table(tmp_path / "sweep").values()
-    assert [row["status"] for row in rows] == ["failed", "done"]
-    assert {row["error"] for row in rows} == {"its process was lost (exit code -9)", ""}
-    again = with_own_classes(*words, cwd=tmp_path)
+    broken, killed, working = table(tmp_path / "sweep").values()
+    assert (broken["status"], broken["error"]) == ("failed", "RuntimeError: first second")
+    assert (killed["status"], killed["error"]) == ("failed", "its process died (exit code -9)")
+    assert (working["status"], working["error"]) == ("done", "")
+    assert "in learn\n" in (tmp_path / "sweep" / broken["job"] / "error.txt").read_text()
+    again = script("train.py", *words, cwd=tmp_path, PYTHONPATH=path)
     assert "0 to run" in again.stderr  # what failed is remembered
 
 
@@ -209,15 +204,8 @@ def curve_begun(path: Path) -> bool:
     return path.read_text().count("\n") > 2
 
 
-def wait_for(condition: Callable[[], object], seconds: float = 180) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
 def wait_for_a_job(folder: Path) -> None:
-    wait_for(lambda: any(curve_begun(path) for path in folder.glob("sweep/*/curve.csv")))
+    wait_for(lambda: any(curve_begun(path) for path in folder.glob("sweep/*/curve.csv")), "a job")
 
 
 def test_ctrl_c_ends_it_and_it_says_how_to_go_on(tmp_path: Path) -> None:
@@ -239,7 +227,7 @@ def test_workers_do_not_outlive_a_killed_sweep(workers: tuple[str, ...], tmp_pat
     with start("train.py", *endless("seed=0,1,2", *workers), cwd=tmp_path) as process:
         wait_for_a_job(tmp_path)
         process.kill()
-    wait_for(lambda: not members(process.pid))
+    wait_for(lambda: not members(process.pid), "the workers' end")
     looked = script("jobs.py", "sweep", cwd=tmp_path)
     assert looked.returncode == 0
     assert looked.stdout.splitlines()[-1].startswith("3 jobs: ")
@@ -275,7 +263,7 @@ def cut_off(run: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (with_other_settings, "holds an unfinished run with other settings (total_timesteps=500"),
+        (with_other_settings, "contains an unfinished run with other settings (total_timesteps=500"),
         (made_longer, "the run in seed=0 was made 700 steps long"),
         (cut_off, "manifest.json: is not JSON, it was changed or cut off"),
     ],
@@ -321,28 +309,15 @@ def test_a_full_disk_is_told_and_the_same_line_goes_on(most: int, stands: set[st
     assert set(statuses(tmp_path / "sweep").values()) == {"done"}
 
 
-def test_a_folder_that_is_in_use_or_damaged_is_refused(tmp_path: Path) -> None:
-    folder = tmp_path / "sweep"
-    folder.mkdir()
-    with locked(folder / ".lock", wait=0) as is_ours:
-        assert is_ours
+def test_a_lock_keeps_a_second_sweep_out_and_ends_with_its_block(tmp_path: Path) -> None:
+    path = tmp_path / "sweep" / ".lock"
+    path.parent.mkdir()
+    assert not is_locked(path)
+    with locked(path, wait=0) as first, locked(path, wait=0.05) as second:
+        assert (first, second, is_locked(path)) == (True, False, True)
         done = sweep("seed=0", cwd=tmp_path)
     assert done.returncode == 2
-    assert done.stderr == "error: sweep: another process runs this sweep; wait for it or stop it\n"
-    (folder / "sweep.json").write_text('{"format": 1, "asked": [], "jobs": [{}]}')
-    before = sorted(folder.iterdir())
-    done = sweep("seed=0", cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("error: sweep/sweep.json: damaged (")
-    assert sorted(folder.iterdir()) == before
-
-
-def test_a_lock_is_seen_and_ends_with_its_block(tmp_path: Path) -> None:
-    path = tmp_path / "lock"
-    assert not is_locked(path)
-    with locked(path, wait=0), locked(path, wait=0.05) as is_ours:
-        assert not is_ours
-        assert is_locked(path)
+    assert done.stderr == "error: sweep: another process is using it; wait for it or stop it\n"
     assert not is_locked(path)
 
 
@@ -366,15 +341,3 @@ def test_a_table_that_was_damaged_or_lost_is_made_again(swept: Path) -> None:
             file.write_text(damage)
         jobs_command.main([str(swept / "sweep")])
         assert file.read_text() == before
-
-
-def test_the_jobs_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    sweep("seed=0,-1,1", cwd=tmp_path)
-    jobs_command.main([str(tmp_path / "sweep")])
-    *rows, total = capsys.readouterr().out.splitlines()
-    assert [row.split()[0] for row in rows] == ["seed=0", "seed=-1", "seed=1"]
-    assert [row.split()[1] for row in rows] == ["done", "failed", "done"]
-    assert rows[1].endswith("seed=-1: must be from 0 to 4294967295")
-    assert total == "3 jobs: 2 done, 1 failed"
-    jobs_command.main([str(tmp_path / "sweep"), "--status", "failed"])
-    assert len(capsys.readouterr().out.splitlines()) == 2

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 from helpers import forks
-from helpers.clusters import ray_head, slurm, wait_for
-from helpers.support import script, start
+from helpers.clusters import ray_head, slurm
+from helpers.support import script, start, wait_for
 from test_sweep import OWN_CLASSES, QUICK, curve_begun, statuses, table
 
 pytestmark = pytest.mark.slow
@@ -103,7 +103,7 @@ def test_a_lost_process_is_told_and_takes_no_other_job_along(cluster: Cluster, t
     assert done.returncode == 1, done.stderr
     rows = list(table(tmp_path / "sweep").values())
     assert [row["status"] for row in rows] == ["failed", "done"]
-    assert rows[0]["error"].startswith("its process was lost (")
+    assert rows[0]["error"].startswith("its process died (")
     assert "0 to run" in cluster.sweep(*words, cwd=tmp_path).stderr
 
 
@@ -129,7 +129,7 @@ def test_slurms_warning_interrupts_a_job_and_a_restart_has_the_rest(cluster: Clu
         _, errors = process.communicate(timeout=180)
     assert process.returncode == 1
     assert list(statuses(folder).values()) == ["done", "interrupted", "pending"]
-    assert "the rest did not come to its end; resume with: python " in errors
+    assert "the rest did not finish; resume with: python " in errors
 
 
 @pytest.mark.parametrize("cluster", ["slurm"], indirect=True)
@@ -137,7 +137,7 @@ def test_what_slurm_refuses_is_one_sentence(cluster: Cluster, tmp_path: Path) ->
     done = cluster.sweep("seed=range(150)", cwd=tmp_path)
     assert done.returncode == 2
     assert "hydra/launcher=slurm: Slurm took no array of 150 tasks (" in done.stderr
-    assert done.stderr.rstrip().endswith("of more jobs each, by hydra.launcher.jobs_per_task")
+    assert done.stderr.rstrip().endswith("for fewer tasks, raise hydra.launcher.jobs_per_task")
     nowhere = cluster.sweep("seed=0,1", "hydra.launcher.partition=nowhere", cwd=tmp_path)
     assert nowhere.returncode == 2
     assert "hydra/launcher=slurm: Slurm took no array of 2 tasks (" in nowhere.stderr

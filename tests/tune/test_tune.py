@@ -2,25 +2,28 @@
 
 import contextlib
 import csv
-import dataclasses
 import json
 import os
 import shutil
 import signal
 import sqlite3
 import sys
-import time
+from functools import partial
 from pathlib import Path
 
 import optuna
 import pytest
-from helpers.support import CONF, ROOT, script, start
+import yaml
+from helpers import forks
+from helpers.support import ROOT, script, start, wait_for
 from optuna.trial import TrialState, create_trial
 
 from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
 from gridworld.errors import InputError
-from gridworld.tune.study import at_work_in
+from gridworld.run.folder import claimed
+from gridworld.tune import study as tune_study
+from gridworld.tune import study_spec
 
 QUICK = (
     *("agent=q_learning", "total_timesteps=1500", "recording.gif=false", "recording.learning=false"),
@@ -69,10 +72,9 @@ def test_a_search_leaves_a_row_per_trial_and_a_verdict(studied: Path) -> None:
     "words", [["recipe=study"], ["--config-dir", "study/experiment/..", "experiment=winner"]]
 )
 def test_its_winner_is_a_recipe_of_train_py(words: list[str], studied: Path) -> None:
-    out = f"hydra.run.dir=won by {len(words)}"
-    done = script("train.py", *words, out, "recording.gif=false", cwd=studied)
+    done = script("train.py", *words, "--cfg", "job", cwd=studied)
     assert done.returncode == 0, done.stderr
-    config = json.loads((studied / f"won by {len(words)}" / "manifest.json").read_text())["config"]
+    config = yaml.safe_load(done.stdout)
     winner = json.loads((studied / "study" / "study.json").read_text())["winner"]
     for key, value in winner["values"].items():
         assert config["agent"][key.removeprefix("agent.")] == value, key
@@ -82,7 +84,7 @@ def test_its_winner_is_a_recipe_of_train_py(words: list[str], studied: Path) -> 
 def test_the_same_line_goes_on_with_the_study(studied: Path) -> None:
     before = rows(studied)
     more = script("tune.py", *QUICK, "tune.trials=8", cwd=studied)
-    assert "6 of them there already" in more.stderr
+    assert "6 of them already there" in more.stderr
     assert [row["trial"] for row in rows(studied)] == [str(number) for number in range(8)]
     assert rows(studied)[:6] == before
 
@@ -97,7 +99,7 @@ def test_damaged_runs_of_the_confirmation_are_run_again(studied: Path, tmp_path:
     assert again.returncode == 0, again.stderr
     for file in harmed:
         (told,) = [line for line in again.stderr.splitlines() if f"{file.parent.name}/{file.name}: " in line]
-        assert told.endswith("; it is run again")
+        assert told.endswith("; it runs again")
     confirmed = json.loads((tmp_path / "study" / "study.json").read_text())["confirmation"]
     assert "left out" not in confirmed["sentence"]
     report_command.main([str(tmp_path / "study"), "--formats"])
@@ -117,9 +119,9 @@ def test_the_report_shows_the_study(studied: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (["tune=narrow"], "was begun with another search space: agent.exploration_final_eps was"),
-        (["agent.gamma=0.8"], "was begun with another configuration: agent.gamma was 0.9, now it is 0.8"),
-        (["tune.seeds=3"], "was begun with another objective: seeds was [0, 1], now it is [0, 1, 2]"),
+        (["tune=narrow"], "was started with another search space: agent.exploration_final_eps was"),
+        (["agent.gamma=0.8"], "was started with another configuration: agent.gamma was 0.9, now it is 0.8"),
+        (["tune.seeds=3"], "was started with another objective: seeds was [0, 1], now it is [0, 1, 2]"),
     ],
 )
 def test_a_study_of_another_search_is_refused(
@@ -144,10 +146,10 @@ def test_a_folder_of_another_study_is_refused(
     (tmp_path / "study" / "study.db").unlink()
     before = sorted(tmp_path.rglob("*"))
     told = refusal(monkeypatch, tmp_path, *QUICK)
-    assert "study.db: does not have the study tune_q_learning_classic, which has begun; bring" in told
+    assert "study.db: does not have the study tune_q_learning_classic, which has started; restore" in told
     assert sorted(tmp_path.rglob("*")) == before
-    with at_work_in(tmp_path / "study"):
-        assert "another process is at work in it" in refusal(monkeypatch, tmp_path, *QUICK)
+    with claimed(tmp_path / "study"):
+        assert "another process is using it" in refusal(monkeypatch, tmp_path, *QUICK)
 
 
 def refusal(monkeypatch: pytest.MonkeyPatch, folder: Path, *arguments: str) -> str:
@@ -165,14 +167,14 @@ def test_a_search_that_comes_to_nothing_is_no_mistake_of_the_command_line(
     def all_fail(spec: object, study: optuna.Study, *more: object) -> None:
         study.add_trial(create_trial(state=TrialState.FAIL, user_attrs={"error": "training diverged"}))
 
-    monkeypatch.setattr("gridworld.tune.study.search", all_fail)
+    monkeypatch.setattr(tune_study, "search", all_fail)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(ROOT / "scripts" / "tune.py"), *QUICK])
     with pytest.raises(SystemExit) as ended:
         tune_command.main(QUICK)
     assert ended.value.code == 1
     told = capsys.readouterr().err.splitlines()[-1]
-    assert told == "error: study: no trial came to a score; all 1 failed, the first: training diverged"
+    assert told == "error: study: no trial got a score; all 1 failed, the first: training diverged"
 
 
 def refused(title: str) -> list[list[str]]:
@@ -189,7 +191,7 @@ def test_a_search_space_that_makes_no_sense(
     (tmp_path / "tune").mkdir()
     head = "" if yaml.startswith("# @") else "# @package tune.space\n"
     (tmp_path / "tune" / "bad.yaml").write_text(head + yaml.replace("|", "\n"))
-    monkeypatch.setattr("gridworld.tune.study_spec._CORNERS", 5)  # it goes with none of them
+    monkeypatch.setattr(study_spec, "_CORNERS", 5)  # it goes with none of them
     told = refusal(monkeypatch, tmp_path, "agent=q_learning", "tune=bad", "--config-dir", ".")
     assert sentence in told
     assert "\n" not in told
@@ -209,7 +211,7 @@ def test_a_command_line_that_cannot_be_meant(
 def test_without_optuna_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     told = refusal(monkeypatch, tmp_path, "agent=q_learning")
-    assert told == "tune.py: optuna is not installed; pip install 'gridworld-sb3[tune]'"
+    assert told == f"tune.py: optuna is not installed; pip install -e '{ROOT}[tune]'"
 
 
 LONG = (
@@ -229,36 +231,40 @@ def workers_of(process: int, hundredths: int = 5) -> list[int]:
     return found
 
 
-def wait_for_workers(process: int, count: int, but: int = 0) -> list[int]:
-    end = time.monotonic() + 180
-    while time.monotonic() < end:
-        if len(found := [worker for worker in workers_of(process) if worker != but]) >= count:
-            return found
-        time.sleep(0.02)
-    raise AssertionError("no worker is at work")
+def wait_for_workers(process: forks.Started, count: int, but: int = 0) -> list[int]:
+    found: list[int] = []
+
+    def are_at_work() -> bool:
+        found[:] = [worker for worker in workers_of(process.pid) if worker != but]
+        return len(found) >= count
+
+    wait_for(are_at_work, "workers", process)
+    return found
 
 
 def check_ended(processes: list[int]) -> None:
     """They are gone, or will be in a moment."""
-    end = time.monotonic() + 180
-    for process in processes:
-        with contextlib.suppress(OSError):
-            while Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z":
-                assert time.monotonic() < end
-                time.sleep(0.02)
+
+    def is_gone(process: int) -> bool:
+        try:
+            return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        except OSError:
+            return True
+
+    wait_for(lambda: all(map(is_gone, processes)), "the workers' end")
 
 
 def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path: Path) -> None:
     with start("tune.py", *QUICK, *LONG, cwd=tmp_path) as process:
-        killed = wait_for_workers(process.pid, 2)[0]
+        killed = wait_for_workers(process, 2)[0]
         os.kill(killed, signal.SIGKILL)
-        told = next(line for line in process.stderr if "lost" in line)
-        assert told.strip() == "a worker was lost (exit code -9), attempt 1 of 4 at its task"
-        others = wait_for_workers(process.pid, 2, but=killed)
+        told = next(line for line in process.stderr if "died" in line)
+        assert told.strip() == "a worker died (exit code -9), attempt 1 of 4 at its task"
+        others = wait_for_workers(process, 2, but=killed)
         process.send_signal(signal.SIGINT)
         told = process.stderr.read()  # until the last worker has let go of it
     assert process.returncode == 130
-    assert "stopped by SIGINT; nothing that ended is lost; resume with: python" in told
+    assert "stopped by SIGINT; finished trials are kept; resume with: python" in told
     check_ended(others)
     ended = rows(tmp_path)
 
@@ -279,65 +285,48 @@ def test_a_search_of_one_worker_is_the_same_however_it_is_killed(tmp_path: Path)
         study = json.loads((folder / "study" / "study.json").read_text())
         return found, (study["winner"]["values"], study["confirmation"])
 
+    def has_ended(folder: Path, trials: int) -> bool:
+        file = folder / "study" / "study.db"
+        with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(file)) as study:
+            return len(study.execute("SELECT * FROM trials").fetchall()) >= trials
+        return False
+
     for name, kills in (("calm", 0), ("killed", 2)):
-        (tmp_path / name).mkdir()
+        folder = tmp_path / name
+        folder.mkdir()
         for ended in range(kills):
-            with start("tune.py", *words, cwd=tmp_path / name) as process:
-                wait_for_trials(tmp_path / name / "study" / "study.db", ended)
-                worker = wait_for_workers(process.pid, 1)[0]
+            with start("tune.py", *words, cwd=folder) as process:
+                wait_for(partial(has_ended, folder, ended), "a trial", process)
+                worker = wait_for_workers(process, 1)[0]
                 os.kill(worker, signal.SIGKILL)
-                workers = wait_for_workers(process.pid, 1, but=worker)
+                workers = wait_for_workers(process, 1, but=worker)
                 process.kill()
                 process.stderr.read()  # until the last worker has let go of it
                 check_ended(workers)
-        done = script("tune.py", *words, cwd=tmp_path / name)
+        done = script("tune.py", *words, cwd=folder)
         assert done.returncode == 0, done.stderr
     assert outcome(tmp_path / "killed") == outcome(tmp_path / "calm")
 
 
-def wait_for_trials(database: Path, count: int) -> None:
-    end = time.monotonic() + 180
-    while time.monotonic() < end:
-        with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(database)) as study:
-            if len(study.execute("SELECT * FROM trials").fetchall()) >= count:
-                return
-    raise AssertionError("no such trial ended")
-
-
 def test_a_database_that_disappears_is_one_sentence_and_no_worker_is_left(tmp_path: Path) -> None:
     with start("tune.py", *QUICK, *LONG, cwd=tmp_path) as process:
-        workers = wait_for_workers(process.pid, 2)
+        workers = wait_for_workers(process, 2)
         (tmp_path / "study" / "study.db").unlink()
         told = process.stderr.read().splitlines()
     assert process.returncode == 1
-    errors = [line for line in told if "study cannot be reached any more" in line]
+    errors = [line for line in told if "study can no longer be reached" in line]
     assert len(errors) == 1
     assert errors[0].startswith("error: tune.storage=sqlite:////")
     assert not [line for line in told if "Traceback" in line or "Error" in line]
     check_ended(workers)
 
 
-@pytest.mark.parametrize("threads", [1, 2])  # workers are forks, or new processes
-def test_ctrl_c_while_workers_start_is_one_sentence(threads: int, tmp_path: Path) -> None:
-    for children in (1, 2):
-        with start("tune.py", *QUICK, *LONG, f"threads={threads}", cwd=tmp_path) as process:
-            end = time.monotonic() + 180
-            while len(workers_of(process.pid, 0)) < children and time.monotonic() < end:
-                time.sleep(0.001)
-            os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-            told = process.stderr.read()
-        assert process.returncode == 130
-        assert "Traceback" not in told
-        assert "stopped by SIGINT; nothing that ended is lost; resume with: python" in told
-
-
-def test_every_key_of_the_settings_stands_in_its_yaml() -> None:
-    from omegaconf import OmegaConf
-
-    from gridworld.config.sweep import TuneConfig
-
-    given = OmegaConf.load(CONF / "tune.yaml")["tune"]
-    assert set(given) == {field.name for field in dataclasses.fields(TuneConfig)} - {"space"}
-    for field in dataclasses.fields(TuneConfig):
-        if field.name != "space":
-            assert given[field.name] == field.default, field.name
+@pytest.mark.parametrize(("threads", "children"), [(1, 1), (2, 2)])  # workers are forks, or new processes
+def test_ctrl_c_while_workers_start_is_one_sentence(threads: int, children: int, tmp_path: Path) -> None:
+    with start("tune.py", *QUICK, *LONG, f"threads={threads}", cwd=tmp_path) as process:
+        wait_for(lambda: len(workers_of(process.pid, 0)) >= children, "workers", process)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        told = process.stderr.read()
+    assert process.returncode == 130
+    assert "Traceback" not in told
+    assert "stopped by SIGINT; finished trials are kept; resume with: python" in told

@@ -4,7 +4,6 @@ import contextlib
 import errno
 import io
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +63,7 @@ def test_a_gif_holds_any_film_exactly() -> None:
     still = animation_of_states(CLASSIC, np.zeros(1500, dtype=int), cell_size=4)
     assert sum(duration for _, duration in frames_of(files.encode_gif(still, 1))) == 1504 * 1000
     noise = chance.integers(256, size=(40, 40, 3), dtype=np.uint8)
-    with pytest.raises(InputError, match="more than 256 colours"):
+    with pytest.raises(InputError, match="at most 256 colours"):
         animation_of_frames([noise])
 
 
@@ -99,7 +98,7 @@ def test_films_that_memory_or_a_player_could_not_hold_are_refused(monkeypatch: p
     assert automatic_cell_size(CLASSIC) == 100
     assert automatic_cell_size(compile_mdp(parse("S" + "." * 98 + "G", "wide"))) == 9
     monkeypatch.setattr(files, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install 'gridworld-sb3\[video\]'"):
+    with pytest.raises(InputError, match=r"pip install -e '.*\[video\]'"):
         files.require_video()
 
 
@@ -151,39 +150,10 @@ def test_a_failed_folder_leaves_the_old_one(keep: bool, tmp_path: Path) -> None:
     assert left == ["frames", "frames/old"] * keep
 
 
-def test_a_folder_takes_the_place_of_a_link_and_not_of_what_it_leads_to(tmp_path: Path) -> None:
-    (tmp_path / "outside").mkdir()
-    (tmp_path / "outside" / "file").touch()
-    part = f".frames.{os.getpid()}"
-    for name in ("frames", f"{part}.part", f"{part}.old.part"):
-        (tmp_path / name).symlink_to("outside")
-    files.save_pngs(animation_of_states(CLASSIC, WALK[:1], 20), tmp_path / "frames")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames", "outside"]
-    assert [path.name for path in (tmp_path / "frames").iterdir()] == ["0000.png"]
-    assert [path.name for path in (tmp_path / "outside").iterdir()] == ["file"]
-
-
-@pytest.mark.parametrize("place", ["thing", "file/thing", "nowhere/thing"])
-@pytest.mark.parametrize(
-    "write", [lambda path: write_json(path, {}), lambda path: files.save_png(FRAME, path)]
-)
-def test_what_cannot_be_written_is_named_and_nothing_else_is_touched(
-    write: Callable[[Path], None], place: str, tmp_path: Path
-) -> None:
-    (tmp_path / "thing" / "full").mkdir(parents=True)
-    (tmp_path / "file").touch()
-    path = tmp_path / place
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(OSError, match=r".") as error:
-        write(path)
-    assert error.value.filename in (str(path), str(path.parent))
-    assert sorted(tmp_path.rglob("*")) == before
-
-
 FAILURES = [
-    (errno.EACCES, "a/b.gif", "a/b.gif: Permission denied; choose another folder than a, or get the right"),
-    (errno.EROFS, "b.gif", "b.gif: Read-only file system; choose another folder than ., or get the right"),
-    (errno.ENOSPC, "a/b.gif", "a/b.gif: No space left on device; make room there"),
+    (errno.EACCES, "a/b.gif", "a/b.gif: Permission denied; choose another folder, or make a writable"),
+    (errno.EROFS, "b.gif", "b.gif: Read-only file system; choose another folder, or make . writable"),
+    (errno.ENOSPC, "a/b.gif", "a/b.gif: No space left on device; free some space there"),
     (errno.EISDIR, "a/b.gif", "a/b.gif: Is a directory"),
     (errno.EIO, None, "Input/output error"),
     (None, None, "cannot write mode P as PNG"),

@@ -9,7 +9,6 @@ from helpers.support import SHORT, train_in
 from PIL import Image
 
 from gridworld.agents import PolicySnapshot
-from gridworld.config.train import PICTURES
 from gridworld.envs.rendering import AGENT, CLIFF, GOAL, TRAP, UNKNOWN, WALL, Frame
 from gridworld.visualization.canvas import Canvas, greedy_paths
 from gridworld.visualization.maps import (
@@ -19,7 +18,7 @@ from gridworld.visualization.maps import (
     explored,
     value_error,
 )
-from gridworld.visualization.picture import PolicyHistory, drawer
+from gridworld.visualization.picture import PolicyHistory
 from gridworld.visualization.sheet import BLUES, DISAGREES, ORANGES, VIRIDIS, Scale, counting, linear, short
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
@@ -244,18 +243,13 @@ def test_pictures_can_be_switched_off_and_the_learning_gif_lasts_as_long_as_its_
     tmp_path: Path,
 ) -> None:
     names = ("policy_map", "q_error", "visits", "frames", "gif")
-    settings = [*(f"recording.{name}=false" for name in names), "recording.fps=5"]
+    settings = [*(f"recording.{name}=false" for name in names), "recording.fps=5", "recording.cell_size=50"]
     train_in(tmp_path, *SHORT["q_learning"], *settings)
     assert [path.name for path in tmp_path.iterdir() if path.suffix in (".png", ".gif")] == ["learning.gif"]
     total = 0
     with Image.open(tmp_path / "learning.gif") as film:
+        assert film.width == 50 * (6 + 2)
         for index in range(film.n_frames):
             film.seek(index)
             total += film.info["duration"]
     assert total == 200 * (5 + 4)  # five evaluations, and the last one rests
-
-
-def test_every_picture_has_a_drawer_and_a_file_of_its_own() -> None:
-    assert len({picture.file for picture in PICTURES}) == len(PICTURES)
-    for picture in PICTURES:
-        assert callable(drawer(picture.drawer))

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -82,8 +81,7 @@ def subject(mdp: Mdp, q: NDArray[np.float64], visits: NDArray[np.int64]) -> Subj
     history = PolicyHistory(mdp.num_states)
     for step in range(3):
         history.add(step, snapshot)
-    run = {"config": TrainConfig(), "evaluator": Evaluator(mdp, 0.95, 50), "steps": 3, "is_trusted": True}
-    return SimpleNamespace(**run, snapshot=snapshot, visits=visits, history=history)
+    return Subject(TrainConfig(), True, Evaluator(mdp, 0.95, 50), snapshot, 3, visits, history)
 
 
 def cell_of(mdp: Mdp, frame: Frame, state: int, legend_rows: int = 1) -> Frame:

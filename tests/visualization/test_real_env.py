@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gridworld.config.worlds import GymnasiumConfig
+from gridworld.envs.rendering import board_of
 from gridworld.errors import InputError
 from gridworld.visualization.episode import rendered_frames
 from gridworld.world.mdp import Mdp
@@ -54,6 +55,12 @@ def test_an_enumerated_environment_takes_the_same_walk():
         expected.append(env.render())
     env.close()
     assert np.array_equal(frames_of(name, states, mdp, **short), expected)
+    assert {*mdp.panel_names} == {f"facing {way}" for way in ("right", "down", "left", "up")}
+    assert mdp.places is not None
+    assert mdp.places.max(axis=0).tolist() == [3, 2, 2]  # 3 x 3 cells, once for each direction
+    facing_right = (mdp.places == 0).all(axis=1)  # at the start, at all steps from 0 to 12
+    assert (board_of(mdp).summed(np.ones(mdp.num_states))[facing_right] == facing_right.sum()).all()
+    assert facing_right.sum() > 2
     with pytest.raises(
         InputError, match="no action leads from row 2, column 2, facing right, step 0 to row 2, column 2"
     ):
@@ -68,7 +75,7 @@ def test_large_frames_are_made_smaller():
 @pytest.mark.parametrize(
     ("env_id", "words"),
     [
-        ("NoSuchWorld-v0", "is not an environment .*doesn't exist"),
+        ("NoSuchWorld-v0", "is not registered with Gymnasium .*doesn't exist"),
         *((name, r"cannot be rendered: [^\n]*$") for name in ("Pendulum-v1", "CartPole-v1", "Blackjack-v1")),
     ],
 )

@@ -11,12 +11,8 @@ from hypothesis import strategies as st
 from scipy.stats import binom, chi2_contingency
 
 import gridworld
-from gridworld.agents import family
-from gridworld.engine.environments import Environments
 from gridworld.envs import rollout
-from gridworld.envs.observations import make_observation
 from gridworld.envs.rollout import play, sample_episodes
-from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.training.setup import check_settings, make_context, objective_note
 from gridworld.workarounds import blas_threads
@@ -108,27 +104,19 @@ def test_slips_do_not_depend_on_the_actions_of_training(monkeypatch, agent: str)
     """SB3 seeds the action space, from which DQN explores, with the run's seed: not the environments'."""
     walked: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
-    def advance(self, actions):
-        before = self.states
-        answer = GridWorldVectorEnv.advance(self, actions)
-        walked.append((before, np.asarray(actions), answer[0] if answer[4] is None else answer[4].states))
-        return answer
+    def watched(self, pairs):
+        step = advance(self, pairs)
+        walked.append((*np.divmod(pairs, 4), step.reached))
+        return step
 
-    def stepped(self, actions):
-        before = self.states
-        answer = step(self, actions)
-        walked.append((before, actions, answer.last_states))
-        return answer
-
-    step = Environments.step
-    monkeypatch.setattr(StatisticsVectorEnv, "advance", advance)
-    monkeypatch.setattr(Environments, "step", stepped)
+    advance = GridWorldVectorEnv._advance
+    monkeypatch.setattr(GridWorldVectorEnv, "_advance", watched)
     config = configure(f"agent={agent}", "env.slip=0.3", "env=four_rooms", "total_timesteps=19200")
     if agent == "dqn":
         config.agent.learning_starts = 19_000
     mdp = config.env.compile()
-    context = make_context(config, mdp, make_observation(mdp, "one_hot"))
-    family(config.agent).build(config.agent, context).learn(config.total_timesteps, lambda steps: steps + 1)
+    context = make_context(config, mdp)
+    config.agent.build(context).learn(config.total_timesteps, lambda steps: steps + 1)
     assert_independent(slip_table(mdp, walked))
 
 

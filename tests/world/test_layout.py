@@ -48,7 +48,7 @@ def test_every_tile_is_read_where_it_stands(rows):
         (b"S#.S\n##.G\n", r"no goal can be reached from the start in row 1, column 1"),
         (b"..TG\nS.TT\n", r"no goal can be reached from the start in row 2, column 1"),
         (b"..CG\nS.TC\n", r"no goal can be reached from the start in row 2, column 1"),
-        (b"S.SG\n..CS\n", r"a cliff 'C' sends back to the start, and there are 3; leave one 'S'"),
+        (b"S.SG\n..CS\n", r"a cliff 'C' leads back to the start, but there are 3; keep one 'S'"),
         (b"\x89PNG\r\n\x1a\n\x00\xff\xd8", r"not a text file.*byte 1 "),
         (b"S..G\xff\n", r"not a text file.*byte 5 "),
         (b"S" + b"." * 262143 + b"G", r"too large.*262144"),
@@ -137,7 +137,9 @@ def test_classic_takes_exactly_the_sizes_that_can_be_won():
             assert classic(num_rows, num_cols).text() == "\n".join(rows)
             won.add((num_rows, num_cols))
             continue
-        with pytest.raises(InputError, match=f"{num_rows} x {num_cols} cells: cannot hold .* 4 rows and 3"):
+        with pytest.raises(
+            InputError, match=f"{num_rows} x {num_cols} cells: has no room for .* 4 rows and 3"
+        ):
             classic(num_rows, num_cols)
     assert won == set(itertools.product(range(4, 13), range(3, 13)))  # as the sentence says
 
@@ -157,9 +159,9 @@ def test_a_size_that_contradicts_the_map_is_refused(tmp_path):
     [
         ({"starts": ((1, 2),)}, "row 2, column 3: a start on a goal"),
         ({"starts": ((0, 0), (0, 0))}, "row 1, column 1: a start on a start"),
-        ({"cliffs": ((0, 3),)}, "row 1, column 4: this cliff lies outside"),
-        ({"cliffs": ((0, 2),), "starts": ((0, 0), (0, 1))}, "a cliff 'C' sends back to the start"),
-        ({"walls": frozenset({(0, -1)})}, "this wall lies outside"),
+        ({"cliffs": ((0, 3),)}, "row 1, column 4: this cliff is outside"),
+        ({"cliffs": ((0, 2),), "starts": ((0, 0), (0, 1))}, "a cliff 'C' leads back to the start"),
+        ({"walls": frozenset({(0, -1)})}, "this wall is outside"),
         ({"traps": ((1, 1),), "walls": frozenset({(0, 1)})}, "no goal can be reached"),
         ({"num_rows": 0}, "num_rows"),
         ({"num_cols": 3.0}, "num_cols"),

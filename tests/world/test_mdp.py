@@ -86,6 +86,6 @@ def test_numbers_of_any_kind_will_do(value):
 
 def test_a_cliff_that_pays_is_refused():
     cliff = parse("SCG\n...", "map")
-    with pytest.raises(InputError, match=r"trap_reward=0.5: must be at most 0 where the map has a cliff"):
+    with pytest.raises(InputError, match=r"trap_reward=0.5: must be at most 0 on maps with a cliff"):
         compile_mdp(cliff, trap_reward=0.5)
     assert compile_mdp(cliff, trap_reward=0).reward.max() == 1

@@ -134,8 +134,8 @@ def twice_in_a_row(self: Any, reward: Any) -> float:
 
 
 _MEMORY, _BELOW, _COUNTER = (
-    "keeps a memory",
-    "looks into the environment below",
+    "keeps memory",
+    "reads from the environment below",
     "a Counter, whose __getstate",
 )
 REFUSED: dict[str, tuple[Any, str]] = {  # a wrapper, and what is said of it

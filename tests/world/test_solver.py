@@ -72,7 +72,7 @@ def test_the_textbook_world_of_russell_and_norvig():
 
 def test_without_discount_a_positive_step_reward_has_no_optimum():
     mdp = made("S.G", step_reward=0.1)
-    with pytest.raises(InputError, match=r"gamma=1 in map: who goes on for ever is paid"):
+    with pytest.raises(InputError, match=r"gamma=1 in map: an episode that never ends"):
         solve.value_iteration(mdp, 1)
     assert solve.value_iteration(mdp, 0.5).v[0] == pytest.approx(0.65)  # 0.1 + 0.5 * 1.1 beats waiting: 0.2
 

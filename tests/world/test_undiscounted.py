@@ -204,5 +204,5 @@ def test_what_hardly_shows_in_a_value_still_decides(rows, slip, step, goal, trap
 
 @pytest.mark.parametrize("gamma", [1 - 1e-12, 1 - 2**-46, 1 - 2**-53])
 def test_a_discount_that_rounding_hides_is_refused(gamma):
-    with pytest.raises(InputError, match="so near to 1 that rounding hides"):
+    with pytest.raises(InputError, match="so close to 1 that rounding hides"):
         value_iteration(compile_mdp(load("classic")), gamma)

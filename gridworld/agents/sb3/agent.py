@@ -16,8 +16,17 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from torch import nn
 
-from gridworld.agents import Hook, Learning, PolicySnapshot, SafePoint, TrainingContext, WriteScalars, misfit
-from gridworld.agents.sb3.callbacks import RunCallback, check_finite, class_without_state
+from gridworld.agents import (
+    Agent,
+    Hook,
+    Learning,
+    PolicySnapshot,
+    SafePoint,
+    TrainingContext,
+    WriteScalars,
+    misfit,
+)
+from gridworld.agents.sb3.callbacks import RunCallback, check_finite, class_without_state, get_state
 from gridworld.agents.sb3.factory import algorithm_and_arguments, failed, make_callbacks, make_model, unfit
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.model_file import read_model
@@ -63,7 +72,7 @@ def build(config: SB3Config, context: TrainingContext) -> SB3Agent:
         if unknown is not None:
             ours = None
             if not context.only_asked:
-                tell(f"engine: stock, since the tabulated one does not cover {unknown}")
+                tell(f"engine: stock, since the tabulated engine does not support {unknown}")
     keeps = ours is None and not context.only_asked
     model = make_model(config, context, algorithm, arguments, with_buffers=keeps)
     if ours is not None:
@@ -99,7 +108,7 @@ def unknown_to_engine(
     return None
 
 
-class SB3Agent:
+class SB3Agent(Agent):
     """One SB3 model, which learns in SB3's own loop."""
 
     def __init__(self, config: SB3Config, context: TrainingContext, model: BaseAlgorithm) -> None:
@@ -119,7 +128,7 @@ class SB3Agent:
                 warnings.simplefilter("ignore")  # which come again while it learns
                 why = why_no_table(self._model.policy, self.observation)
         except Exception as error:  # the class may be anybody's
-            raise failed(self.config, "cannot be asked", error) from error
+            raise failed(self.config, "cannot be evaluated", error) from error
         if why is not None:
             raise unfit(self.config, why)
 
@@ -131,9 +140,9 @@ class SB3Agent:
         self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
         interval, falling = self.config.log_interval, self.config.falling()
-        self._callback = RunCallback(on_step, on_safe_point, state, interval, self._callbacks, falling)
+        callback = RunCallback(on_step, on_safe_point, state, interval, self._callbacks, falling)
         try:
-            self._model.learn(total_timesteps, callback=self._callback, log_interval=interval)
+            self._model.learn(total_timesteps, callback=callback, log_interval=interval)
         except (InputError, OSError, StateError):
             raise
         except Exception as error:
@@ -150,8 +159,7 @@ class SB3Agent:
         return class_without_state(self._model, self._callbacks)
 
     def get_state(self) -> State:
-        """See `gridworld.agents.Agent.get_state`, for while it learns."""
-        return self._callback.get_state()
+        return get_state(self._model, self._callbacks)
 
     def snapshot(self) -> PolicySnapshot:
         return self._snapshot(*read_table(self._model.policy, self.observation))
@@ -248,9 +256,6 @@ class EngineAgent(SB3Agent):
                 error = agent.run.failed_update
                 agent.run.error = failed(agent.config, "cannot make its first update", error)
         return [agent.run.error for agent in agents]
-
-    def class_without_state(self) -> None:
-        """See `gridworld.agents.Agent.class_without_state`: the engine takes known classes alone."""
 
     def get_state(self) -> State:
         return self.run.population.get_state(self.run)

@@ -118,10 +118,6 @@ class RunCallback(CallbackList):
                 self._on_safe_point(self.model.num_timesteps)
         super()._on_training_end()
 
-    def get_state(self) -> State:
-        """The model's state while it waits at a rollout's start."""
-        return get_state(self.model, self._others)
-
 
 class FallingSetting(BaseCallback):
     """Lets a number of a model of SB3's fall to 0 over training; usable in SB3's own `learn()`.

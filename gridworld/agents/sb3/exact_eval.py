@@ -108,8 +108,8 @@ class ForeignPolicy:
             return seen
         if seen is not None and seen.kind not in KINDS:
             raise InputError(
-                f"the model sees {wanted}, and the environment shows {seen.space}; give the environment that "
-                "the model was trained on, as model.get_env() has it"
+                f"the model expects {wanted}, but the environment shows {seen.space}; give the environment "
+                "that it was trained on, model.get_env()"
             )
         guess = observation_like(self._task.mdp, wanted)
         self._check_guess(guess)
@@ -125,14 +125,14 @@ class ForeignPolicy:
             shown = None if task.seen is None else task.seen()
         except InputError as error:
             raise InputError(
-                f"the model: what it was shown in training is not known ({error}); give an environment that "
-                "shows the same"
+                f"the model: its training observations are unknown ({error}); give an environment that "
+                "shows the same ones"
             ) from None
         alike = shown is not None and shown.space == guess.space and same(shown.table(), guess.table())
         if not alike and (shown is None or shown.kind not in KINDS):
             raise InputError(
-                f"the model was shown observations of its own in training, and {guess.kind} of this world "
-                "only has the same space; give an environment with the wrappers that it was trained on"
+                f"the model was trained on custom observations, and {guess.kind} of this world merely has "
+                "the same space; give an environment with the wrappers of training"
             )
         self._guess_is_fine = True
 
@@ -151,12 +151,12 @@ class ForeignPolicy:
         except Exception as error:  # it may be anybody's own
             raise InputError(f"the model: its predict() raised {in_short(error)}") from error
         if state is not None:
-            raise InputError(f"the model: its predict() keeps a state from step to step, {NO_TABLE}")
+            raise InputError(f"the model: its predict() keeps a state between steps, {NO_TABLE}")
         fits = actions.shape == np.shape(states) and actions.dtype.kind in "iu"
         if not fits or not np.isin(actions, np.arange(self._task.mdp.num_actions)).all():
             raise InputError(
-                f"the model: its predict() gave {str(actions)[:60]} for {np.size(states)} states; must be an "
-                f"action of each, {self._task.mdp.action_choices()}"
+                f"the model: its predict() returned {str(actions)[:60]} for {np.size(states)} states; must "
+                f"be an action per state, {self._task.mdp.action_choices()}"
             )
         return actions
 
@@ -171,7 +171,7 @@ class ForeignPolicy:
         if reason is None and random_states() != before:
             reason = f"draws random numbers for its best action, {NO_TABLE}"
         if reason is None and any((each != together).any() for each in rounds):
-            reason = f"takes different actions in one state, asked alone, again and with others, {NO_TABLE}"
+            reason = f"does not always take the same action in the same state, {NO_TABLE}"
         if reason is not None:
             raise InputError(f"the model {reason}")
 
@@ -314,16 +314,13 @@ class ExactEvalCallback(BaseCallback):
         self.logger.dump(step)
         if score.shortfall < self.best_regret:
             self.best_regret = score.shortfall
-            self._keep_best()
+            if self.verbose >= 1:
+                print(f"step {step:,}: new best model, exact regret {self.best_regret:.3g}")
+            if self._best_path is not None:
+                self._best_path.mkdir(parents=True, exist_ok=True)
+                with replacing(self._best_path / BEST_MODEL) as part, part.open("wb") as file:
+                    self.model.save(file)
         if self._log_path is not None:
             table = self.evaluations
             self._log_path.mkdir(parents=True, exist_ok=True)
             write_evaluations(self._log_path / EVALUATIONS, table, **table)
-
-    def _keep_best(self) -> None:
-        if self.verbose >= 1:
-            print(f"step {self.num_timesteps:,}: new best model, exact regret {self.best_regret:.3g}")
-        if self._best_path is not None:
-            self._best_path.mkdir(parents=True, exist_ok=True)
-            with replacing(self._best_path / BEST_MODEL) as part, part.open("wb") as file:
-                self.model.save(file)

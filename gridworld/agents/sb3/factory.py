@@ -54,7 +54,7 @@ def failed(config: SB3Config, what: str, error: Exception) -> InputError:
     if isinstance(config, SB3ClassConfig):
         given |= {name: value for name, value in config.arguments.items() if name != "policy_kwargs"}
     suspects = ", ".join(f"{config.where}.{name}={value}" for name, value in given.items())
-    return unfit(config, f"{what}: {in_short(error)}" + (f"; look at {suspects}" if suspects else ""))
+    return unfit(config, f"{what}: {in_short(error)}" + (f"; check {suspects}" if suspects else ""))
 
 
 def algorithm_and_arguments(
@@ -87,8 +87,7 @@ def algorithm_and_arguments(
 
 def algorithm_class(where: str, path: Any) -> type[BaseAlgorithm]:
     """Import a class of SB3's kind; see `import_class`."""
-    algorithm: type[BaseAlgorithm] = import_class(where, path, BaseAlgorithm)
-    return algorithm
+    return import_class(where, path, BaseAlgorithm)
 
 
 def import_class(where: str, path: Any, kind: type) -> Any:
@@ -104,8 +103,7 @@ def _policy(config: SB3Config, algorithm: type[BaseAlgorithm]) -> type[BasePolic
     if config.policy in algorithm.policy_aliases:
         return algorithm.policy_aliases[config.policy]
     if "." in config.policy:
-        policy: type[BasePolicy] = import_class("agent.policy", config.policy, BasePolicy)
-        return policy
+        return import_class("agent.policy", config.policy, BasePolicy)
     known = ", ".join(name for name in algorithm.policy_aliases if name != "MultiInputPolicy")
     raise InputError(f"agent.policy={config.policy}: {config.algorithm} has {known}")
 
@@ -143,7 +141,7 @@ class NoBuffer(BaseBuffer):
         pass
 
     def _get_samples(self, *arguments: Any, **options: Any) -> Any:
-        raise NotImplementedError("nothing was kept")
+        raise NotImplementedError("this buffer stores nothing")
 
 
 def make_model(

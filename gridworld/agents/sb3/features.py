@@ -54,7 +54,9 @@ class FourierFeatures(_Extractor):
 
     def __init__(self, observation_space: spaces.Space[Any], orders: Sequence[int] | None = None) -> None:
         if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
-            raise InputError(f"FourierFeatures: must see coordinates, a Box (d,); {observation_space} is not")
+            raise InputError(
+                f"FourierFeatures: needs coordinates, a Box of shape (d,), not {observation_space}"
+            )
         (dimensions,) = observation_space.shape
         largest = max(int(_FEATURES ** (1 / dimensions) + 1e-9) - 1, 1)
         given = orders if isinstance(orders, Iterable) else [orders]
@@ -164,7 +166,7 @@ def _standing_out(channels: Tensor) -> Tensor:
 def _image_shape(name: str, space: spaces.Space[Any], cell_size: int) -> tuple[int, int, int]:
     shape = space.shape or ()
     if len(shape) != 3:
-        raise InputError(f"{name}: must see images, (channels, height, width); {space} is none")
+        raise InputError(f"{name}: needs images, (channels, height, width), not {space}")
     if not (type(cell_size) is int and 0 < cell_size <= min(shape[1:])):
         raise InputError(
             f"{name}: cell_size={cell_size}: must be from 1 to the image's {min(shape[1:])} pixels"

@@ -67,9 +67,9 @@ def _members(content: bytes) -> dict[str, bytes]:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         infos = archive.infolist()
         if any(info.compress_type for info in infos):
-            raise ValueError("it has compressed members, a model file has none")
+            raise ValueError("it has compressed members, unlike model files")
         if sum(info.file_size for info in infos) > len(content):
-            raise ValueError("its members are larger than itself")
+            raise ValueError("its members are larger than the file")
         return {info.filename: archive.read(info) for info in infos}
 
 
@@ -77,12 +77,11 @@ def load_tensors(content: bytes) -> dict[str, Any]:
     """Read a dictionary of tensors as torch saves it; ValueError, or whatever torch raises: it is none."""
     pickles = [member for name, member in _members(content).items() if name.endswith(".pkl")]
     if len(pickles) != 1 or len(pickles[0]) > _LARGEST_PICKLE:
-        raise ValueError("it holds no tensors as torch writes them")
+        raise ValueError("it has no tensors in torch's format")
     for code, argument, _ in pickletools.genops(pickles[0]):  # which does not run it
         if code.name in _NAMING and not (code.name == "GLOBAL" and _NAMED.fullmatch(str(argument))):
-            raise ValueError(f"its pickle asks for {str(argument)[:80]}, which is not read from a model")
-    found: dict[str, Any] = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    return found
+            raise ValueError(f"its pickle asks for {str(argument)[:80]}, which a model may not contain")
+    return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
 
 
 def _flat(found: dict[str, Any]) -> dict[str, Tensor]:

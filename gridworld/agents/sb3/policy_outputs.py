@@ -18,7 +18,7 @@ from gridworld.world.mdp import BoolArray, FloatArray
 CHUNK = 4096  # states a forward pass
 _ASKED = 512  # states
 _PART = 3
-NO_TABLE = "so no table of it can be evaluated exactly"
+NO_TABLE = "so it cannot be evaluated exactly"
 
 
 class Reading(NamedTuple):
@@ -33,12 +33,10 @@ def why_unreadable(policy: BasePolicy) -> str | None:
     """Why a policy's outputs cannot be read as a table over states; None: they can."""
     for module in policy.modules():
         if isinstance(module, nn.RNNBase):
-            return f"keeps a memory from step to step ({type(module).__name__}), {NO_TABLE}"
+            return f"keeps memory between steps ({type(module).__name__}), {NO_TABLE}"
     if _is_actor_critic(policy) or hasattr(policy, "q_net") or hasattr(policy, "quantile_net"):
         return None
-    return (
-        f"has neither probabilities and values nor Q values of a state ({type(policy).__name__}), {NO_TABLE}"
-    )
+    return f"has neither action probabilities and values nor Q values ({type(policy).__name__}), {NO_TABLE}"
 
 
 def why_no_table(policy: BasePolicy, observation: ObservationTable) -> str | None:
@@ -54,7 +52,7 @@ def why_no_table(policy: BasePolicy, observation: ObservationTable) -> str | Non
             continue
         same = torch.allclose(one, other, rtol=0, atol=0, equal_nan=True)
         if not same or not torch.allclose(one[::_PART], fewer, rtol=1e-3, atol=1e-4, equal_nan=True):
-            return f"does not always give the same answer in the same state, {NO_TABLE}"
+            return f"does not always answer the same in the same state, {NO_TABLE}"
     return None
 
 
@@ -93,8 +91,7 @@ def read_table(
 
 def explored(greedy: FloatArray, epsilon: float) -> FloatArray:
     """(S, A), the action probabilities of SB3's exploration around a greedy policy (S, A)."""
-    mixed: FloatArray = (1 - epsilon) * greedy + epsilon / greedy.shape[1]
-    return mixed
+    return (1 - epsilon) * greedy + epsilon / greedy.shape[1]
 
 
 def _is_actor_critic(policy: BasePolicy) -> bool:

@@ -43,7 +43,7 @@ class ReplayCounts(ReplayBuffer):
     ) -> None:
         if options.get("optimize_memory_usage"):
             raise InputError(
-                "optimize_memory_usage=true: ReplayCounts has each transition once; set it to false"
+                "optimize_memory_usage=true: ReplayCounts stores each transition once; set it to false"
             )
         super().__init__(_ROOM, observation_space, action_space, device, 1, **options)
         self.counts: IntArray = np.zeros(self.buffer_size, dtype=np.int64)

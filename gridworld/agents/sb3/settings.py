@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass
+from pathlib import Path
 from typing import Any, Optional
 
 from gridworld.bounds import MOST_STEPS, Bounds
@@ -119,7 +120,7 @@ class SB3Config(AgentConfig):
         found = vars(given) if is_dataclass(given) else given
         if not isinstance(found, dict):
             raise InputError(
-                f"{self.where}.policy_kwargs={found}: must be settings, e.g. {{net_arch:[64,64]}}"
+                f"{self.where}.policy_kwargs={found}: must be a mapping, e.g. {{net_arch:[64,64]}}"
             )
         return {name: value for name, value in found.items() if value is not None and value != {}}
 
@@ -159,6 +160,52 @@ class SB3Config(AgentConfig):
             name: parse_schedule(name, self.given[name]) for name in FALLING if falls(self.given.get(name))
         }
 
+    def check(self, run: TrainConfig) -> None:
+        # What SB3 would fail on later, or accept with another meaning.
+        super().check(run)
+        if self.engine not in ("tabulated", "stock"):
+            raise InputError(f"agent.engine={self.engine}: must be tabulated or stock")
+        for index, entry in enumerate(run.callbacks):
+            path = entry.get("_target_") if isinstance(entry, dict) else None
+            if not isinstance(path, str) or "." not in path:
+                raise InputError(
+                    f"callbacks[{index}]={entry}: must be a mapping of _target_, the import path of a "
+                    "callback's class, and its arguments"
+                )
+        steps = {"step_reward": run.env.max_episode_steps or 1, "goal_reward": 1, "trap_reward": 1}
+        for name, times in steps.items():  # an episode's return and its square must be numbers of 32 bits
+            most, reward = _MOST_RETURN / times, vars(run.env).get(name, 0.0)
+            Bounds(-most, most, least=_LEAST_REWARD).check(f"env.{name}", reward)
+        key, value = self.key("train_freq"), self.given.get("train_freq", 1)
+        count, unit = value if isinstance(value, list | tuple) and len(value) == 2 else (value, "step")
+        if type(count) is not int or unit not in ("step", "episode"):
+            raise InputError(f"{key}={value}: must be a whole number, or [N,step] or [N,episode]")
+        Bounds(1, MOST_STEPS).check(key, count, value)
+        if unit == "episode" and run.n_envs > 1:
+            raise InputError(f"{key}={value}: SB3 counts episodes of a single environment only; set n_envs=1")
+
+    def build(self, context: Any) -> Any:
+        from gridworld.agents.sb3.agent import build
+
+        return build(self, context)
+
+    def import_libraries(self) -> None:
+        # Nothing is computed, which would keep torch from forking.
+        from gridworld.agents.sb3 import agent  # noqa: F401
+
+    def on_processor(self, device: str) -> bool:
+        from stable_baselines3.common.utils import get_device
+
+        try:
+            return get_device(device).type == "cpu"
+        except RuntimeError:  # of names that `build` refuses
+            return True
+
+    def weights(self, path: Path, most: int) -> dict[str, Any]:
+        from gridworld.agents.sb3.model_file import read_weights
+
+        return read_weights(path, most)
+
 
 @dataclass
 class SB3ClassConfig(SB3Config):
@@ -183,6 +230,19 @@ class SB3ClassConfig(SB3Config):
 
     def key(self, name: str) -> str:
         return f"{'' if name in self.arguments else '+'}agent.arguments.{name}"
+
+    def check(self, run: TrainConfig) -> None:
+        super().check(run)
+        for name, value in self.arguments.items():
+            key, number = f"agent.arguments.{name}", value
+            if name in ("policy", "env", "seed", "device"):
+                raise InputError(f"{key}: is a setting of the run, not an argument of the class")
+            if name in (*FALLING, *SCHEDULES) and falls(value):
+                number = parse_schedule(key, value).initial
+            if name in _BOUNDS and value is not None:
+                if isinstance(number, bool) or not isinstance(number, int | float):
+                    raise InputError(f"{key}={value}: must be a number")
+                _BOUNDS[name].check(key, number, value)
 
 
 @dataclass
@@ -223,6 +283,16 @@ class DQNConfig(SB3CheckedConfig):
     exploration_final_eps: float = field(default=0.05, metadata=_SHARE)
     max_grad_norm: float = field(default=10.0, metadata=_POSITIVE)
 
+    def check(self, run: TrainConfig) -> None:
+        super().check(run)
+        if self.counts_transitions and self.n_steps > 1:
+            raise InputError(f"agent.n_steps={self.n_steps}: ReplayCounts counts single steps; must be 1")
+        if self.learning_starts >= run.total_timesteps:
+            raise InputError(
+                f"agent.learning_starts={self.learning_starts}: nothing would be learned; "
+                f"must be below total_timesteps={run.total_timesteps}"
+            )
+
 
 @dataclass
 class PPOConfig(SB3CheckedConfig):
@@ -247,6 +317,14 @@ class PPOConfig(SB3CheckedConfig):
     rollout_buffer_kwargs: Arguments = field(default_factory=dict)
     target_kl: Optional[float] = field(default=None, metadata=_POSITIVE)  # noqa: UP045
 
+    def check(self, run: TrainConfig) -> None:
+        super().check(run)
+        if (rollout := self.n_steps * run.n_envs) % self.batch_size:
+            raise InputError(
+                f"agent.batch_size={self.batch_size}: must divide the rollout, "
+                f"agent.n_steps={self.n_steps} x n_envs={run.n_envs} = {rollout} steps"
+            )
+
 
 SCHEMAS: dict[str, type[AgentConfig]] = {"dqn": DQNConfig, "ppo": PPOConfig, "sb3": SB3ClassConfig}
 
@@ -256,64 +334,3 @@ _BOUNDS: dict[str, Bounds] = {  # of numbers by their names in SB3 and sb3-contr
     for name, metadata in declared(schema).items()
     if BOUNDS in metadata
 }
-
-
-def check(config: TrainConfig) -> None:
-    """See `gridworld.agents.Family.check`: what SB3 would fail on later, or accept with another meaning."""
-    agent = config.agent
-    assert isinstance(agent, SB3Config)
-    if agent.engine not in ("tabulated", "stock"):
-        raise InputError(f"agent.engine={agent.engine}: must be tabulated or stock")
-    for index, entry in enumerate(config.callbacks):
-        path = entry.get("_target_") if isinstance(entry, dict) else None
-        if not isinstance(path, str) or "." not in path:
-            raise InputError(
-                f"callbacks[{index}]={entry}: must be a mapping of _target_, the import path of a callback's "
-                "class, and its arguments"
-            )
-    # An episode's return and its square must be numbers of 32 bits.
-    for name, times in (
-        ("step_reward", config.env.max_episode_steps or 1),
-        ("goal_reward", 1),
-        ("trap_reward", 1),
-    ):
-        reward = vars(config.env).get(name, 0.0)
-        Bounds(-_MOST_RETURN / times, _MOST_RETURN / times, least=_LEAST_REWARD).check(f"env.{name}", reward)
-    if isinstance(agent, SB3ClassConfig):
-        _check_arguments(agent.arguments)
-    if isinstance(agent, DQNConfig) and agent.counts_transitions and agent.n_steps > 1:
-        raise InputError(f"agent.n_steps={agent.n_steps}: ReplayCounts counts single steps; must be 1")
-    if isinstance(agent, DQNConfig) and agent.learning_starts >= config.total_timesteps:
-        raise InputError(
-            f"agent.learning_starts={agent.learning_starts}: nothing would be learned; "
-            f"must be below total_timesteps={config.total_timesteps}"
-        )
-    if isinstance(agent, PPOConfig) and (rollout := agent.n_steps * config.n_envs) % agent.batch_size:
-        raise InputError(
-            f"agent.batch_size={agent.batch_size}: must divide the rollout, "
-            f"agent.n_steps={agent.n_steps} x n_envs={config.n_envs} = {rollout} steps"
-        )
-    if (frequency := agent.given.get("train_freq")) is not None:
-        _check_train_freq(agent.key("train_freq"), frequency, config.n_envs)
-
-
-def _check_arguments(arguments: Mapping[str, Any]) -> None:
-    for name, value in arguments.items():
-        key, number = f"agent.arguments.{name}", value
-        if name in ("policy", "env", "seed", "device"):
-            raise InputError(f"{key}: is a setting of the run; must not be among the class's arguments")
-        if name in (*FALLING, *SCHEDULES) and falls(value):
-            number = parse_schedule(key, value).initial
-        if name in _BOUNDS and value is not None:
-            if isinstance(number, bool) or not isinstance(number, int | float):
-                raise InputError(f"{key}={value}: must be a number")
-            _BOUNDS[name].check(key, number, value)
-
-
-def _check_train_freq(key: str, value: Any, n_envs: int) -> None:
-    count, unit = value if isinstance(value, list | tuple) and len(value) == 2 else (value, "step")
-    if type(count) is not int or unit not in ("step", "episode"):
-        raise InputError(f"{key}={value}: must be a whole number, or [N,step] or [N,episode]")
-    Bounds(1, MOST_STEPS).check(key, count, value)
-    if unit == "episode" and n_envs > 1:
-        raise InputError(f"{key}={value}: SB3 counts episodes of one environment only; must be with n_envs=1")

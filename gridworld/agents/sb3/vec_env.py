@@ -66,23 +66,18 @@ class GridWorldVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        states, rewards, terminated, truncated, ended = self.envs.advance(self._actions)
-        if self._reward_scale != 1:
-            rewards = rewards * self._reward_scale
+        step = self.envs.advance(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        if ended is None:
-            return self.observation.rows(states), rewards.astype(np.float32), terminated, infos
-        truncated &= ~terminated
-        elapsed = round(time.time() - self._started, 6)
-        last = self.observation.rows(ended.states[ended.which])
-        of_each = zip(ended.which.tolist(), last, ended.returns.tolist(), ended.lengths.tolist(), strict=True)
+        last, elapsed = self.observation.rows(step.reached[step.which]), round(time.time() - self._started, 6)
+        of_each = zip(step.which.tolist(), last, step.returns.tolist(), step.lengths.tolist(), strict=True)
         for index, observation, episode_return, length in of_each:
             infos[index] = {
                 "terminal_observation": observation,
-                "TimeLimit.truncated": bool(truncated[index]),
+                "TimeLimit.truncated": bool(step.truncated[index] and not step.terminated[index]),
                 "episode": {"r": episode_return, "l": length, "t": elapsed},
             }
-        return self.observation.rows(states), rewards.astype(np.float32), ended.mask, infos
+        rewards = (step.rewards * self._reward_scale).astype(np.float32)
+        return self.observation.rows(step.states), rewards, step.terminated | step.truncated, infos
 
     def close(self) -> None:
         self.envs.close()
@@ -99,7 +94,9 @@ class GridWorldVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         if len(list(self._get_indices(indices))) != self.num_envs:
-            raise InputError(f"{attr_name}: the batch has one set of attributes; set it for all environments")
+            raise InputError(
+                f"{attr_name}: the environments of a native batch share their attributes; set it for all"
+            )
         setattr(self.envs, attr_name, value)
 
     def env_method(
@@ -108,7 +105,7 @@ class GridWorldVecEnv(VecEnv):
         if method_name == _MASKS:
             allowed = np.ones(self.envs.mdp.num_actions, dtype=np.bool_)
             return [allowed] * len(list(self._get_indices(indices)))
-        raise InputError(f"{method_name}: the environments of a native batch have no methods of their own")
+        raise InputError(f"{method_name}: the environments of a native batch have no individual methods")
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
         """True for Monitor, whose `episode` entries the infos have."""

@@ -1,6 +1,6 @@
-"""The tabular algorithms: settings and a class each, in `ALGORITHMS` by what `agent.algorithm` calls them.
+"""The tabular algorithms: a class each, and its settings, which build it.
 
-A new one is two such classes and a row there, and a yaml in `conf/agent` that chooses its schema.
+A new one is two such classes, a row in `SCHEMAS`, and a yaml in `conf/agent` that chooses its schema.
 
 Reference: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, sections 6.4 to 6.6.
 """
@@ -12,30 +12,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gridworld.agents import Hook, PolicySnapshot, SafePoint, TrainingContext
 from gridworld.agents.tabular.td_control import (
+    TabularAgent,
     TabularConfig,
     TabularControl,
     TabularControlConfig,
     epsilon_greedy,
-    model_bytes,
-    read_model,
 )
 from gridworld.config.fields import Word, privilege
+from gridworld.config.train import AgentConfig
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 from gridworld.world.solver import value_iteration
 
 if TYPE_CHECKING:
-    from gridworld.envs.vector_env import Ended
-
-
-@dataclass
-class QLearningConfig(TabularControlConfig):
-    name: Word = "q_learning"
-    algorithm: Word = "q_learning"
+    from gridworld.envs.vector_env import Step
 
 
 class QLearning(TabularControl):
@@ -46,14 +41,16 @@ class QLearning(TabularControl):
 
     def state_values(self, q: FloatArray) -> FloatArray:
         """max_a Q(s, a), whatever epsilon is."""
-        best: FloatArray = q.max(axis=-1)
-        return best
+        return q.max(axis=-1)
 
 
 @dataclass
-class ExpectedSarsaConfig(TabularControlConfig):
-    name: Word = "expected_sarsa"
-    algorithm: Word = "expected_sarsa"
+class QLearningConfig(TabularControlConfig):
+    name: Word = "q_learning"
+    algorithm: Word = "q_learning"
+
+    def build(self, context: TrainingContext) -> QLearning:
+        return QLearning(self, context)
 
 
 class ExpectedSarsa(TabularControl):
@@ -65,14 +62,16 @@ class ExpectedSarsa(TabularControl):
 
     def state_values(self, q: FloatArray) -> FloatArray:
         """Σ_a π(a | s) Q(s, a) under the ε-greedy policy π of the moment."""
-        expected: FloatArray = (epsilon_greedy(q, self.exploration_rate) * q).sum(axis=-1)
-        return expected
+        return (epsilon_greedy(q, self.exploration_rate) * q).sum(axis=-1)
 
 
 @dataclass
-class SarsaConfig(TabularControlConfig):
-    name: Word = "sarsa"
-    algorithm: Word = "sarsa"
+class ExpectedSarsaConfig(TabularControlConfig):
+    name: Word = "expected_sarsa"
+    algorithm: Word = "expected_sarsa"
+
+    def build(self, context: TrainingContext) -> ExpectedSarsa:
+        return ExpectedSarsa(self, context)
 
 
 class Sarsa(ExpectedSarsa):
@@ -88,31 +87,27 @@ class Sarsa(ExpectedSarsa):
 
     def _values_ahead(self, reached: IntArray) -> FloatArray:
         self._drawn = self._act(reached)
-        ahead: FloatArray = self.q[reached, self._drawn]
-        return ahead
+        return self.q[reached, self._drawn]
 
-    def _next_actions(self, states: IntArray, ended: Ended | None) -> IntArray:
-        if ended is not None:
-            self._drawn[ended.which] = self._act(states[ended.which])
+    def _next_actions(self, step: Step) -> IntArray:
+        if step.which.size:
+            self._drawn[step.which] = self._act(step.states[step.which])
         return self._drawn
 
 
 @dataclass
-class ValueIterationConfig(TabularConfig):
-    """The exact optimum under `gamma`; nothing is trained."""
+class SarsaConfig(TabularControlConfig):
+    name: Word = "sarsa"
+    algorithm: Word = "sarsa"
 
-    name: Word = "value_iteration"
-    algorithm: Word = field(
-        default="value_iteration", metadata=privilege("plans with the tables", "value_iteration")
-    )
+    def build(self, context: TrainingContext) -> Sarsa:
+        return Sarsa(self, context)
 
 
-class ValueIteration:
+class ValueIteration(TabularAgent):
     """Q* under the agent's own discount, solved for when it is built, for comparison with what learns.
 
-    Attributes:
-        q: (S, A), Q*.
-        optimal: (S, A), True for every action as good as the best.
+    `optimal` (S, A) is True for every action as good as the best.
     """
 
     def __init__(self, config: ValueIterationConfig, context: TrainingContext) -> None:
@@ -121,28 +116,18 @@ class ValueIteration:
         if not np.isfinite(solution.q).all():
             worst = mdp.state_name(int(np.argmin(solution.v)))
             raise InputError(
-                f"agent.gamma={config.gamma}: from {worst} no end can be reached, "
-                "which costs without end; take a gamma below 1"
+                f"agent.gamma={config.gamma}: no end can be reached from {worst}, which costs infinitely "
+                "much; use a gamma below 1"
             )
-        self._algorithm = config.algorithm
-        self.q: FloatArray = solution.q
+        self.config, self.q = config, solution.q
         self.optimal: BoolArray = solution.optimal
-
-    @property
-    def model(self) -> FloatArray:
-        return self.q
 
     def learn(
         self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
-        """See `gridworld.agents.Agent.learn`. Nothing is left to learn: 0 steps."""
-        on_step(0)
-
-    def class_without_state(self) -> None:
-        """See `gridworld.agents.Agent.class_without_state`."""
+        on_step(0)  # nothing is left to learn
 
     def get_state(self) -> State:
-        """See `gridworld.agents.Agent.get_state`. There is none: it is solved for again."""
         return {}
 
     def snapshot(self) -> PolicySnapshot:
@@ -154,19 +139,32 @@ class ValueIteration:
             q=self.q.copy(),
         )
 
-    def model_file(self) -> bytes:
-        return model_bytes(self._algorithm, {"q": self.q, "optimal": self.optimal})
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        return {"q": self.q, "optimal": self.optimal}
 
     def load(self, path: Path) -> None:
-        arrays = read_model(path, self._algorithm, {"q": self.q, "optimal": self.optimal})
+        arrays = self.read(path)
         if not arrays["optimal"].any(axis=1).all():
-            raise InputError(f"{path}: optimal names no action in some states")
+            raise InputError(f"{path}: optimal has no action for some states")
         self.q, self.optimal = arrays["q"], arrays["optimal"]
 
 
-ALGORITHMS: dict[str, tuple[type[TabularConfig], Any]] = {
-    "expected_sarsa": (ExpectedSarsaConfig, ExpectedSarsa),
-    "q_learning": (QLearningConfig, QLearning),
-    "sarsa": (SarsaConfig, Sarsa),
-    "value_iteration": (ValueIterationConfig, ValueIteration),
+@dataclass
+class ValueIterationConfig(TabularConfig):
+    """The exact optimum under `gamma`; nothing is trained."""
+
+    name: Word = "value_iteration"
+    algorithm: Word = field(
+        default="value_iteration", metadata=privilege("plans with the tables", "value_iteration")
+    )
+
+    def build(self, context: TrainingContext) -> ValueIteration:
+        return ValueIteration(self, context)
+
+
+SCHEMAS: dict[str, type[AgentConfig]] = {
+    "expected_sarsa": ExpectedSarsaConfig,
+    "q_learning": QLearningConfig,
+    "sarsa": SarsaConfig,
+    "value_iteration": ValueIterationConfig,
 }

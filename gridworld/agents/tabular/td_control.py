@@ -9,9 +9,8 @@ Reference: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, chapte
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import Hook, PolicySnapshot, SafePoint, TrainingContext, misfit
+from gridworld.agents import Agent, Hook, PolicySnapshot, SafePoint, TrainingContext, misfit
 from gridworld.bounds import Bounds
 from gridworld.config.fields import MOST_KEPT, Effect, Schedule, Word, affects, bounds, parse_schedule, rate
-from gridworld.config.train import AgentConfig
+from gridworld.config.train import AgentConfig, TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.user_input import npz_arrays, npz_bytes
 from gridworld.storage.safe_read import read_bytes
@@ -37,7 +36,7 @@ from gridworld.storage.serialization import (
 from gridworld.world.mdp import LEAST_REWARD, MOST_REWARD, FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from gridworld.envs.vector_env import Ended
+    from gridworld.envs.vector_env import Step
 
 _BELOW_ONE = 1 - 2**-53  # replaces a step of 1, after which nothing of the past is left
 _SPARE_BYTES = 2**20  # of a model file, for the frames around its arrays
@@ -47,6 +46,21 @@ _SPARE_BYTES = 2**20  # of a model file, for the frames around its arrays
 class TabularConfig(AgentConfig):
     family: Word = "tabular"
     gamma: float = field(default=0.99, metadata=bounds(0, 1))  # the discount it learns with
+
+    def check(self, run: TrainConfig) -> None:
+        super().check(run)
+        if run.observation.kind != "none":
+            what = f"observation={run.observation.kind}"
+            raise InputError(f"{what}: agent={self.name} keeps a table over states; must be none")
+        if run.callbacks:
+            raise InputError(
+                f"callbacks: agent={self.name} does not call Stable-Baselines3's callbacks; leave them out"
+            )
+        if run.device not in ("cpu", "auto"):
+            raise InputError(f"device={run.device}: agent={self.name} runs on the CPU; must be cpu")
+
+    def weights(self, path: Path, most: int) -> dict[str, Any]:
+        return read_arrays(path, most)
 
 
 @dataclass
@@ -70,19 +84,47 @@ class TabularControlConfig(TabularConfig):
     log_interval: int = field(default=100, metadata=affects(Effect.LABELS) | bounds(1))
 
 
-class TabularControl(ABC):
-    """One table Q (S, A) of float64, learned on a batch of environments.
+class TabularAgent(Agent):
+    """An agent that is a table Q (S, A) of float64, `q`. Its model file is an .npz of `arrays`."""
+
+    q: FloatArray
+    config: TabularConfig
+
+    @property
+    def model(self) -> FloatArray:
+        return self.q
+
+    @abstractmethod
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What it has learnt, by names."""
+
+    def model_file(self) -> bytes:
+        return npz_bytes({"algorithm": np.array(self.config.algorithm), **self.arrays()})
+
+    def read(self, path: Path) -> dict[str, NDArray[Any]]:
+        """Read a model file of arrays that have the names, types and shapes of its own."""
+        own, algorithm = self.arrays(), self.config.algorithm
+        found = read_arrays(path, _SPARE_BYTES + sum(array.nbytes for array in own.values()), algorithm)
+        written_by = str(found.pop("algorithm", "something else"))
+        if written_by != algorithm:
+            raise InputError(f"{path}: not a model of {algorithm} but of {written_by[:50]}")
+        if (reason := misfit(found, own)) is not None:
+            raise InputError(f"{path}: not a model of {algorithm} for this world ({reason})")
+        return found
+
+
+class TabularControl(TabularAgent):
+    """Temporal-difference control on a batch of environments.
 
     Attributes:
-        q: (S, A), the table.
         visits: (S, A), int64, the number of updates of each entry.
         exploration_rate: epsilon.
     """
 
     def __init__(self, config: TabularControlConfig, context: TrainingContext) -> None:
         mdp = context.envs.mdp
-        self.config = config
-        self.q: FloatArray = np.full((mdp.num_states, mdp.num_actions), config.initial_value)
+        self.config: TabularControlConfig = config
+        self.q = np.full((mdp.num_states, mdp.num_actions), config.initial_value)
         self.q[mdp.terminal] = 0.0
         self.visits: IntArray = np.zeros(self.q.shape, dtype=np.int64)
         self.exploration_rate = config.exploration_initial_eps
@@ -95,10 +137,6 @@ class TabularControl(ABC):
         self._last: deque[tuple[float, int]] = deque(maxlen=config.stats_window_size)  # (return, length)
         self._error, self._updates = 0.0, 0  # since the last log
 
-    @property
-    def model(self) -> FloatArray:
-        return self.q
-
     @abstractmethod
     def state_values(self, q: FloatArray) -> FloatArray:
         """(n,), V of the policy whose Q the table is, from rows (n, A) of the table."""
@@ -108,9 +146,9 @@ class TabularControl(ABC):
         rows, index = _rows_of(self.q, reached)
         return self.state_values(rows)[index]
 
-    def _next_actions(self, states: IntArray, ended: Ended | None) -> IntArray:
-        """(num_envs,), the actions to take in `states` (num_envs,), after the update."""
-        return self._act(states)
+    def _next_actions(self, step: Step) -> IntArray:
+        """(num_envs,), the actions to take after a step and the update."""
+        return self._act(step.states)
 
     def learn(
         self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
@@ -122,35 +160,31 @@ class TabularControl(ABC):
         if state is not None:
             with fitting():
                 self._set_state(state)
-            states = envs.states
         start, final = config.exploration_initial_eps, config.exploration_final_eps
         should_continue = True
         while should_continue and self._steps < total_timesteps:
             rate = self._rate.at(self._steps / total_timesteps)
-            pairs = states * self.q.shape[1] + self._actions
-            states, rewards, _, _, ended = envs.advance(self._actions)
+            step = envs.advance(self._actions)
             self._steps = steps = self._steps + envs.num_envs
             explored = min(steps / total_timesteps / config.exploration_fraction, 1.0)
             self.exploration_rate = start + (final - start) * explored
-            reached = states if ended is None else ended.states  # before the reset of what is over
-            targets = rewards + config.gamma * self._values_ahead(reached)
-            error = update(q, visits, pairs, targets, rate, config.learning_rate_power)
+            targets = step.rewards + config.gamma * self._values_ahead(step.reached)
+            error = update(q, visits, step.pairs, targets, rate, config.learning_rate_power)
             if not error < np.inf:
                 raise InputError(
-                    f"agent={config.name}: training diverged at step {steps:,}, the error of its update "
-                    "is not a finite number; try a smaller learning rate"
+                    f"agent={config.name}: training diverged at step {steps:,}, its error is not finite; "
+                    "try a smaller learning rate"
                 )
-            self._actions = self._next_actions(states, ended)
-            self._log(ended, error, rate)
+            self._actions = self._next_actions(step)
+            self._log(step, error, rate)
             should_continue = on_step(steps) > 0
             if on_safe_point is not None and should_continue:
                 on_safe_point(steps)
 
-    def _log(self, ended: Ended | None, error: float, rate: float) -> None:
+    def _log(self, step: Step, error: float, rate: float) -> None:
         """Count an update, and write means, under SB3's names, if enough episodes have ended."""
-        if ended is not None:
-            self._episodes += len(ended.which)
-            self._last.extend(zip(ended.returns.tolist(), ended.lengths.tolist(), strict=True))
+        self._episodes += len(step.which)
+        self._last.extend(zip(step.returns.tolist(), step.lengths.tolist(), strict=True))
         self._error += error
         self._updates += 1
         write = self._context.write_scalars
@@ -167,9 +201,6 @@ class TabularControl(ABC):
         }
         write(scalars, self._steps)
         self._error, self._updates = 0.0, 0
-
-    def class_without_state(self) -> None:
-        return
 
     def get_state(self) -> State:
         return {
@@ -207,14 +238,11 @@ class TabularControl(ABC):
             q=self.q.copy(),
         )
 
-    def _arrays(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> dict[str, NDArray[Any]]:
         return {"q": self.q, "visits": self.visits, "exploration_rate": np.array(self.exploration_rate)}
 
-    def model_file(self) -> bytes:
-        return model_bytes(self.config.algorithm, self._arrays())
-
     def load(self, path: Path) -> None:
-        arrays = read_model(path, self.config.algorithm, self._arrays())
+        arrays = self.read(path)
         epsilon = float(arrays["exploration_rate"])
         Bounds(0, 1).check(f"{path}: exploration_rate", epsilon)
         self.q, self.visits, self.exploration_rate = arrays["q"], arrays["visits"], epsilon
@@ -263,8 +291,7 @@ def update(
 def epsilon_greedy(q: FloatArray, epsilon: float) -> FloatArray:
     """π(a | s) (..., A) of values Q (..., A): with probability ε any action, else one of the best."""
     best = q == q.max(axis=-1, keepdims=True)
-    policy: FloatArray = epsilon / q.shape[-1] + (1 - epsilon) * best / best.sum(axis=-1, keepdims=True)
-    return policy
+    return epsilon / q.shape[-1] + (1 - epsilon) * best / best.sum(axis=-1, keepdims=True)
 
 
 def draw_actions(q: FloatArray, epsilon: float, states: IntArray, draws: FloatArray) -> IntArray:
@@ -280,23 +307,6 @@ def draw_actions(q: FloatArray, epsilon: float, states: IntArray, draws: FloatAr
 def _rows_of(q: FloatArray, states: IntArray) -> tuple[FloatArray, IntArray | slice]:
     """The rows of Q to compute with, the whole table if that is less, and where in them `states` are."""
     return (q, states) if len(q) <= len(states) else (q[states], slice(None))
-
-
-def model_bytes(algorithm: str, arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """The content of a model file: an .npz of the arrays and the algorithm's name."""
-    return npz_bytes({"algorithm": np.array(algorithm), **arrays})
-
-
-def read_model(path: Path, algorithm: str, like: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Read an algorithm's model file; its arrays must have the names, types and shapes of `like`."""
-    most = _SPARE_BYTES + sum(array.nbytes for array in like.values())
-    found = read_arrays(path, most, algorithm)
-    written_by = str(found.pop("algorithm", "something else"))
-    if written_by != algorithm:
-        raise InputError(f"{path}: not a model of {algorithm} but of {written_by[:50]}")
-    if (reason := misfit(found, like)) is not None:
-        raise InputError(f"{path}: not a model of {algorithm} for this world ({reason})")
-    return found
 
 
 def read_arrays(path: Path, most: int, algorithm: str = "a table") -> dict[str, NDArray[Any]]:

@@ -25,7 +25,7 @@ def not_tried(run: Evidence) -> Finding | None:
     with np.errstate(invalid="ignore"):
         missing = best.v - ahead >= _EXPLAINED * (best.v - ours.value(best.gamma))
     states = run.split.wrong & (missing | (run.visits.sum(axis=1) == 0))
-    return _exploration(run, states, "actions that it needs were hardly ever tried") if states.any() else None
+    return _exploration(run, states, "the actions it needs were hardly ever tried") if states.any() else None
 
 
 def collapsed(run: Evidence) -> Finding | None:
@@ -40,7 +40,7 @@ def collapsed(run: Evidence) -> Finding | None:
         states = decided | (run.split.wrong & (goal[-1] < _LEFT * goal[0]))
     if not states.any():
         return None
-    why = f"the policy that it explores with met the goal in {goal[0]:.2g} of its episodes at first"
+    why = f"its exploring policy reached the goal in {goal[0]:.2g} of its episodes at first"
     return _exploration(run, states, f"{why} and in {goal[-1]:.2g} at the end")
 
 
@@ -57,7 +57,7 @@ def ended_early(run: Evidence) -> Finding | None:
 def _exploration(run: Evidence, states: BoolArray, why: str) -> Finding:
     """Whether the steps were too few even for a random walk, or were not used to explore."""
     total, random, needed = run.config.total_timesteps, _random(run), run.steps_to_goal
-    told = "" if np.isinf(needed) else f"; a random walk meets the goal once in {needed:,.0f} steps"
+    told = "" if np.isinf(needed) else f"; a random walk finds the goal once in {needed:,.0f} steps"
     if total < needed or random > _RANDOM:
         changes = (longer(run, 10), *_explore(run)[:2])
         return Finding("budget", states, f"{why}{told}, and it had {total:,}", changes)

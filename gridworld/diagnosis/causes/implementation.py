@@ -10,11 +10,9 @@ import inspect
 import time
 from dataclasses import replace
 
-from gridworld.agents import family
 from gridworld.agents.sb3.settings import SB3ClassConfig
 from gridworld.config.train import AgentConfig
 from gridworld.diagnosis.evidence import Evidence, Finding
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.training.setup import make_context
 
@@ -36,8 +34,8 @@ def faulty_class(run: Evidence) -> Finding | None:
     own, seed = run.config.agent.algorithm, run.config.seed
     when = f"{'still at' if lost else 'at'} steps {' and '.join(steps)} (seeds {seed} and {seed + 1})"
     why = (
-        f"its class is at fault: {sound.algorithm} in the place of {own}, with the same settings, is "
-        f"certified {when}; check.py {own} tells what is wrong"
+        f"its class is at fault: with the same settings, {sound.algorithm} is certified {when}; check.py "
+        f"{own} shows what is wrong"
     )
     return Finding("implementation", run.split.wrong, why, (f"agent.algorithm={sound.algorithm}",))
 
@@ -63,7 +61,6 @@ def _certified_after(
 ) -> int | None:
     """The steps until a certificate, the first or that at the end; None: there is none, or not in time."""
     config = replace(run.config, agent=agent, seed=seed, callbacks=[])
-    observation = make_observation(run.mdp, config.observation.kind, config.observation.cell_size)
     every, due, found = config.evaluation.every, 0, None
 
     def watch(step: int) -> int:
@@ -76,7 +73,7 @@ def _certified_after(
         return due if goes_on else 0
 
     try:
-        learner = family(agent).build(agent, make_context(config, run.mdp, observation))
+        learner = agent.build(make_context(config, run.mdp))
         learner.learn(config.total_timesteps, watch)
     except InputError:  # it diverged
         return None

@@ -38,7 +38,7 @@ def lost_again(run: Evidence) -> Finding | None:
         return None
     steps, last = run.curve["step"], int(certified[-1])
     after = int(steps[min(last + 1, len(steps) - 1)])
-    why = f"it was certified at step {int(steps[last]):,} and had lost that again at step {after:,}"
+    why = f"it was certified at step {int(steps[last]):,} but no longer at step {after:,}"
     sooner = () if run.config.evaluation.stop_after else ("evaluation.stop_after=3",)
     calmer = _settling(run) if run.is_tabular and visits_needed(run) else slower(run)
     return Finding("lost", run.split.wrong, why, (*falling(run), *sooner, calmer[0]))
@@ -52,7 +52,7 @@ def diverged(run: Evidence) -> Finding | None:
     highest, possible = float(run.values[known].max()), float(run.own.v[known].max())
     if highest <= possible + 2 * run.largest_reward:
         return None
-    why = f"its values diverged: they reach {highest:.3g} where no policy earns more than {possible:.3g}"
+    why = f"its values diverged: they reach {highest:.3g}, while no policy earns more than {possible:.3g}"
     interval = run.setting("target_update_interval")
     rarely = (run.change("target_update_interval", 4 * interval),) if interval else ()
     return Finding("diverged", run.split.wrong, why, (slower(run)[0], *rarely))
@@ -65,8 +65,8 @@ def scaled(run: Evidence) -> Finding | None:
     scale, largest = run.setting("reward_scale", 1.0), float(np.abs(run.own.v[run.mdp.acting]).max())
     if scale == 1 or _SMALL <= scale * largest <= _LARGE:
         return None
-    reach = f"with its reward_scale of {scale:g} the values that it learns reach {scale * largest:.2g}"
-    why = f"{reach}, where those of an untrained network are about 0.1"
+    reach = f"with its reward_scale of {scale:g}, its values should reach {scale * largest:.2g}"
+    why = f"{reach}; those of an untrained network are about 0.1"
     return Finding("scale", run.split.wrong, why, (run.change("reward_scale", 1 / run.largest_reward),))
 
 
@@ -94,8 +94,8 @@ def overshot(run: Evidence) -> Finding | None:
         return None
     worst = costliest(run, states)
     why = (
-        f"its updates overshoot: in {run.mdp.state_name(worst)} its policy has {run.spread[worst]:.2g} of a "
-        f"uniform one's entropy, where its bonus of {bonus:g} aims at {aim[worst]:.2g}"
+        f"its updates overshoot: in {run.mdp.state_name(worst)} its policy has {run.spread[worst]:.2g} of "
+        f"the maximum entropy, while its bonus of {bonus:g} aims at {aim[worst]:.2g}"
     )
     return Finding("rate", states, why, slower(run))
 
@@ -120,8 +120,8 @@ def not_there_yet(run: Evidence) -> Finding | None:
     path = run.evaluator.optimum.expected_length
     if interval and run.updates >= _FEW_UPDATES and refreshed < _REFRESHES * path:
         why = (
-            f"its target network was refreshed {refreshed:.0f} times, and a value needs {path:.0f} to come "
-            f"from the goal to the start"
+            f"its target network was refreshed {refreshed:.0f} times, but a value needs {path:.0f} "
+            "refreshes to travel from the goal to the start"
         )
         often = max(1.0, round(run.config.total_timesteps / (8 * path)))
         return Finding("target", states, why, (run.change("target_update_interval", often), longer(run, 4)))
@@ -134,7 +134,7 @@ def _too_short(run: Evidence, states: BoolArray) -> Finding | None:
     total, needed = run.config.total_timesteps, run.steps_to_goal
     if not total < needed < np.inf:
         return None
-    why = f"it was still learning after {total:,} steps; a random walk meets the goal once in {needed:,.0f}"
+    why = f"it was still learning after {total:,} steps; a random walk finds the goal once in {needed:,.0f}"
     return Finding("budget", states, why, (longer(run, 10),))
 
 
@@ -145,7 +145,7 @@ def _slow_table(run: Evidence, states: BoolArray) -> Finding | None:
     where, expects = run.mdp.state_name(worst), float(run.q[worst].max())
     if first > possible and expects > possible * (1 + 1e-9):
         why = (
-            f"it is still optimistic: in {where} it expects {expects:.3g}, and no policy earns {possible:.3g}"
+            f"it is still optimistic: in {where} it expects {expects:.3g}, but the best earns {possible:.3g}"
         )
         return Finding("slow", states, why, (run.change("initial_value", possible), longer(run, 4)))
     rate, power = run.setting("learning_rate"), run.setting("learning_rate_power")
@@ -155,7 +155,7 @@ def _slow_table(run: Evidence, states: BoolArray) -> Finding | None:
     if left < _FORGOTTEN:
         return None
     why = (
-        f"its values have not got there: in {where}, its first values still count for {left:.0%} after "
+        f"its values have not converged: in {where}, the initial values still make up {left:.0%} after "
         f"{'1 update' if tried == 1 else f'{tried:,} updates'}"
     )
     changes = [run.change("learning_rate_power", 0.0)] if power else []
@@ -172,8 +172,8 @@ def unsettled(run: Evidence) -> Finding:
     worst = costliest(run, run.split.wrong)
     error = float(np.abs(run.q - run.own.q)[worst].max())
     why = (
-        f"its values do not settle: in {run.mdp.state_name(worst)} they err by {error:.2g} where the right "
-        f"action is worth {run.gap[worst]:.2g} more"
+        f"its values do not settle: in {run.mdp.state_name(worst)} they are off by {error:.2g}, but the "
+        f"right action is worth only {run.gap[worst]:.2g} more"
     )
     return Finding("rate", run.split.wrong, why, _settling(run))
 

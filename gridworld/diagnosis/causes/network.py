@@ -27,10 +27,10 @@ def cannot_represent(run: Evidence) -> Finding | None:
         worst = costliest(run, run.split.wrong)
         found, name = _alone(run, worst), run.mdp.state_name(worst)
         can = found is None or found.told_apart
-        alone = f"can learn {name} alone" if can else f"cannot even tell {name} from the others"
-        how = f"with new weights and fitted to the exact one, it still errs; its own {alone}"
+        alone = f"can learn {name} alone" if can else f"cannot even distinguish {name} from the others"
+        how = f"with new weights and fitted to the exact answer, it still errs; as trained, it {alone}"
     elif units := _bottleneck(run):
-        how = f"it has a layer of {units}, and the best table of rank {units} still errs"
+        how = f"it has a layer of {units}, and even the best table of rank {units} errs"
     else:
         return None
     why = f"its network cannot hold the answer: {how}"
@@ -55,8 +55,8 @@ def forgets(run: Evidence) -> Finding | None:
         return None
     where = run.mdp.state_name(worst)
     why = (
-        f"it forgets: {where} was met {met[worst]:,} times, of which {kept[worst]:.1g} are in its replay "
-        f"buffer, and to learn that state alone makes {len(found.spoilt)} others wrong"
+        f"it forgets: {where} was visited {met[worst]:,} times, of which {kept[worst]:.1g} are in its "
+        f"replay buffer, and learning that state alone makes {len(found.spoilt)} others wrong"
     )
     return Finding("forgetting", states, why, (run.change("buffer_size", total),))
 
@@ -70,7 +70,7 @@ def spoilt(run: Evidence) -> Finding | None:
     """Its own weights cannot be fitted any more, where new ones can."""
     if _fits(run, fresh=False) is not False:
         return None
-    why = "its weights are spoilt: fitted to the exact answer from them it still errs, from new ones not"
+    why = "its weights are spoilt: fitted to the exact answer from them, it errs; from new ones it does not"
     return Finding("rate", run.split.wrong, why, slower(run))
 
 

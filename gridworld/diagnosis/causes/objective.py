@@ -29,9 +29,7 @@ def other_optimum(run: Evidence) -> Finding | None:
     states = run.split.wrong & (run.gap <= _NOTHING * run.own.scale)
     if run.gamma == best.gamma or not states.any():
         return None
-    why = (
-        f"what it does is optimal under its gamma of {run.gamma:g}, not under the evaluation's {best.gamma:g}"
-    )
+    why = f"its policy is optimal under its gamma of {run.gamma:g}, not under the evaluation's {best.gamma:g}"
     gammas = dict.fromkeys((recommended_gamma(run, states), best.gamma))
     return Finding("objective", states, why, tuple(run.change("gamma", each) for each in gammas))
 
@@ -54,7 +52,7 @@ def _faint(run: Evidence, limit: FloatArray) -> Finding | None:
     if better == run.gamma or not states.any():
         return None
     worst = costliest(run, states)
-    worth = f"worth only {run.gap[worst]:.2g} more, less than its values err"
+    worth = f"worth only {run.gap[worst]:.2g} more, less than the error of its values"
     if run.gap[worst] <= _NOTHING * run.own.scale[worst]:
         worth = "not worth more than what it does"
     why = (
@@ -88,7 +86,7 @@ def too_much_entropy(run: Evidence) -> Finding | None:
     if regret < _POOR * worst or not states.any():
         return None
     why = (
-        f"the policy that its entropy bonus of {bonus:g} aims at has a regret of {regret:.3g}, where a "
+        f"even the policy that its entropy bonus of {bonus:g} aims at has a regret of {regret:.3g}; a "
         f"uniform one has {worst:.3g}"
     )
     return Finding("entropy", states, why, tuple(run.change("ent_coef", bonus / by) for by in (10, 100)))
@@ -105,5 +103,5 @@ def too_much_epsilon(run: Evidence) -> Finding | None:
     states = run.split.wrong & ((gap <= 1e-9) | unresolved)
     if not states.any():
         return None
-    why = f"it learns what is optimal for an agent that is random with probability {epsilon:g}, as it is"
+    why = f"it learns what is optimal for an agent that acts at random with probability {epsilon:g}"
     return Finding("epsilon", states, why, (run.change("exploration_final_eps", epsilon / 10),))

@@ -5,10 +5,8 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import shutil
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -18,7 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from gridworld.config.train import check_bounds
 from gridworld.errors import InputError, install_command
-from gridworld.process.processes import LostError, can_fork, run_in_processes, worker_count
+from gridworld.process.console import repeating
+from gridworld.process.processes import LostError, Processes, can_fork, worker_count
 from gridworld.sweep.folder import STOP
 from gridworld.sweep.job import StopSweep, Worker
 from gridworld.sweep.plan import Job, runs_apart
@@ -58,7 +57,7 @@ def launcher_settings(config: DictConfig) -> tuple[str, dict[str, Any]]:
         missing = [name for name in commands if shutil.which(name) is None]
         if missing:
             raise InputError(
-                f"{choice}: there is no {missing[0]} on this machine; start the sweep on one of the cluster's"
+                f"{choice}: no {missing[0]} on this machine; start the sweep on a machine of the cluster"
             )
     return "basic" if kind == "forks" and not can_fork() else kind, own
 
@@ -75,34 +74,11 @@ def run_groups(launch: Launch, launcher: str, own: Mapping[str, Any]) -> None:
     if apart:
         if launcher == "forks":
             import_for(apart[0].args[0][0].config)  # once for all: forks share it
-        run_in_processes(
-            lambda: apart.pop(0) if apart else None,
-            worker_count(own["n_jobs"]),
-            launcher == "forks",
-            lambda task, errors: launch.ended(task.args[0], errors),
-            launch.tick,
-        )
-    with _ticking(launch.tick):
+        processes = Processes(worker_count(own["n_jobs"]), launcher == "forks")
+        processes.run(apart, lambda task, errors: launch.ended(task.args[0], errors), launch.tick)
+    with repeating(_SECONDS_BETWEEN_TICKS, launch.tick):
         for task in here:
             launch.ended(task.args[0], task())
-
-
-@contextmanager
-def _ticking(tick: Callable[[], None]) -> Iterator[None]:
-    """Call `tick` now and then while the block runs."""
-    over = threading.Event()
-
-    def watch() -> None:
-        while not over.wait(_SECONDS_BETWEEN_TICKS):
-            tick()
-
-    thread = threading.Thread(target=watch, daemon=True, name="sweep progress")
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join(timeout=2)
 
 
 def collect(

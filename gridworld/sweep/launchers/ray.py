@@ -81,5 +81,5 @@ def _connect(arguments: dict[str, Any]) -> None:
         first = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
         raise InputError(
             f"hydra/launcher=ray: no Ray at hydra.launcher.init.address={arguments.get('address')} "
-            f"({first}); start one with 'ray start --head', or let the sweep do it with address=local"
+            f"({first}); start one with 'ray start --head', or from the sweep with address=local"
         ) from None

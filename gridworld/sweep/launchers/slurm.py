@@ -109,8 +109,8 @@ def _submit(
     except (submitit.core.utils.FailedJobError, subprocess.SubprocessError, OSError) as error:
         last = (str(error).strip().splitlines() or [type(error).__name__])[-1]
         raise InputError(
-            f"hydra/launcher=slurm: Slurm took no array of {len(chunks):,} tasks ({last}); there are fewer "
-            "tasks, of more jobs each, by hydra.launcher.jobs_per_task"
+            f"hydra/launcher=slurm: Slurm took no array of {len(chunks):,} tasks ({last}); for fewer tasks, "
+            "raise hydra.launcher.jobs_per_task"
         ) from None
 
 

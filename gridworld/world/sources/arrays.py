@@ -62,11 +62,10 @@ def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
     """Compile the arrays of a custom world, or what numpy makes arrays of, by name; see the module."""
     for key in _NEEDED:
         if key not in arrays:
-            raise InputError(f"{where}: has no {key}, must hold {', '.join(_NEEDED)}")
+            raise InputError(f"{where}: has no {key}, must contain {', '.join(_NEEDED)}")
     if unknown := [key for key in arrays if key not in _NEEDED + _OPTIONAL]:
         raise InputError(
-            f"{where}: {str(unknown[0])[:50]} is not an array of a world; apart from what is needed it may "
-            f"hold {', '.join(_OPTIONAL)}"
+            f"{where}: {str(unknown[0])[:50]} is not an array of a world; optional are {', '.join(_OPTIONAL)}"
         )
     given = {key: _array(where, key, value) for key, value in arrays.items()}
     if given["next_state"].ndim == 2:
@@ -108,8 +107,8 @@ def build(builder: str | Callable[..., Any], kwargs: Mapping[str, Any] | None = 
     mdp, again = (_built(where, function, dict(kwargs or {})) for _ in range(2))
     if mdp.text() != again.text():
         raise InputError(
-            f"{where}: makes another world each time that it is called, so that no run is about one; what it "
-            "draws must follow from env.kwargs, e.g. a seed"
+            f"{where}: returns a different world each time; anything random must follow from env.kwargs, "
+            "e.g. a seed"
         )
     return mdp
 
@@ -208,10 +207,12 @@ def world_from_bytes(content: bytes, where: str) -> Mdp:
 def _from_fields(found: dict[str, NDArray[Any]], where: str) -> Mdp:
     fields = {field.name: field for field in dataclasses.fields(Mdp)}
     if not np.array_equal(found.pop("format", np.array("")), _FORMAT):
-        raise InputError(f"{where}: not a world of this version, must hold format={_FORMAT}")
+        raise InputError(f"{where}: not a world of this version, must contain format={_FORMAT}")
     needed = {name for name, field in fields.items() if field.default is dataclasses.MISSING}
     if not needed <= found.keys() <= fields.keys():
-        raise InputError(f"{where}: not a world, must hold {sorted(needed)}, holds {sorted(found)[:20]}")
+        raise InputError(
+            f"{where}: not a world, must contain {sorted(needed)}, contains {sorted(found)[:20]}"
+        )
     values: dict[str, Any] = dict(found)
     for key in ("name", "truth"):
         if key in found:

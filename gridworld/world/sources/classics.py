@@ -149,7 +149,7 @@ def random_walk(length: int = 5) -> Mdp:
     """
     _check_whole("length", length, 1, MOST_STATES - 2)
     if length % 2 == 0:
-        raise InputError(f"length={length}: must be odd, so that there is a middle to start in")
+        raise InputError(f"length={length}: must be odd, to start in the middle")
     state = np.arange(length + 2)
     next_state = np.stack([np.maximum(state - 1, 0), np.minimum(state + 1, length + 1)], axis=1)
     reward = np.zeros(next_state.shape)

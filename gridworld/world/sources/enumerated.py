@@ -108,6 +108,7 @@ class _State:
     depth: int  # steps from the start
     copy: bytes  # b"" where it is no longer needed
     name: str
+    place: tuple[str, int, int] | None  # which way the agent faces, row and column
     observation: NDArray[Any] | None
     is_open: bool = False  # an episode goes on in it
     steps: Sequence[_Step] = ()  # of each action; empty where none was tried
@@ -154,17 +155,17 @@ class _Search:
                 now = self._snapshots.keys(self.ignore)
                 changed = _listed(name for name, each in now.items() if each != before.get(name))
                 remedy = self._remedy or (
-                    "; take an environment with a fixed layout and start, or name in env.ignore what nothing "
-                    "depends on"
+                    "; use an environment with a fixed layout and start, or list irrelevant attributes in "
+                    "env.ignore"
                 )
                 raise self.refusal(
-                    f"a reset leads to another state with another seed or at another time (in {changed}), so "
-                    f"that its states cannot be enumerated from one start{remedy}"
+                    f"a reset does not always lead to the same state (in {changed}), so its states cannot "
+                    f"be enumerated from one start{remedy}"
                 )
 
     @property
     def _remedy(self) -> str:
-        return "; it has a transition table, so take env=gymnasium" if hasattr(self._env, "P") else ""
+        return "; it has a transition table, so use env=gymnasium" if hasattr(self._env, "P") else ""
 
     def explore(self, limit: int | None) -> None:
         """Find all states that can be reached, and what every action does there.
@@ -181,7 +182,7 @@ class _Search:
         for place, state in enumerate(waiting):  # which grows
             if beyond is None and state.depth >= (limit or _DEEPEST):
                 if limit is None:
-                    still = f"after {_DEEPEST:,} steps there are still new states"
+                    still = f"after {_DEEPEST:,} steps it still finds new states"
                     raise self.refusal(f"{still}, since its {self._what_changes()}")
                 beyond, size = place, len(self.states)
                 self._most_states = min(self._most_states, size + _BEYOND)
@@ -239,21 +240,20 @@ class _Search:
             left_out = ", ".join(self.ignore)
             without = f" without {left_out}, which env.ignore leaves out" if left_out else ""
             raise self.refusal(
-                "the same state is shown by different observations, so that what an agent sees is no "
-                f"function of the state{without}"
+                f"the same state has different observations, so they are not a function of the state{without}"
             )
         return state
 
     def _added(self, key: bytes, seen: bytes, depth: int, copy: bytes, observation: Any) -> _State:
         array, size = self._as_array(observation), 1 + len(self.states)
-        state = _State(size - 1, key, seen, depth, copy, self._state_name(), array)
+        state = _State(size - 1, key, seen, depth, copy, *self._named(), array)
         self._by_key[key] = state
         self.states.append(state)
         self._num_bytes += len(copy) + (0 if array is None else array.nbytes)
         if size > self._most_states:
             raise self.refusal(
-                f"more than {self._most_states:,} states can be reached, and more than that cannot be solved "
-                f"for, since its {self._what_changes()}"
+                f"more than {self._most_states:,} states can be reached, too many to solve, since its "
+                f"{self._what_changes()}"
             )
         if self._num_bytes > _MOST_BYTES:
             raise self.refusal(
@@ -262,17 +262,18 @@ class _Search:
         check_memory(f"env.id={self.name}", self._num_bytes)
         return state
 
-    def _state_name(self) -> str:
-        """What a reader calls its state, by the attributes that minigrid's environments have; else ""."""
+    def _named(self) -> tuple[str, tuple[str, int, int] | None]:
+        """What a reader calls its state, and its place, by attributes that minigrid's environments have."""
         place, direction = (getattr(self._env, name, None) for name in ("agent_pos", "agent_dir"))
         try:
-            (col, row), facing = place, _FACING[direction]  # type: ignore[misc, index]
-            name = f"row {int(row) + 1}, column {int(col) + 1}, facing {facing}"
+            column, row = (int(each) for each in place)  # type: ignore[union-attr]
+            facing = f"facing {_FACING[direction]}"  # type: ignore[index]
         except (TypeError, ValueError, IndexError):
-            return ""
-        carried = getattr(getattr(self._env, "carrying", None), "type", None)
+            return "", None
+        if carried := getattr(getattr(self._env, "carrying", None), "type", None):
+            facing += f", carrying a {carried}"
         time = "" if "step_count" in self.ignore else f", step {getattr(self._env, 'step_count', '?')}"
-        return f"{name}{f', carrying a {carried}' if carried else ''}{time}"
+        return f"row {row + 1}, column {column + 1}, {facing}{time}", (facing, row, column)
 
     def _as_array(self, observation: Any) -> NDArray[Any] | None:
         """An observation as an array, of a Dict the `image`; None where there is none."""
@@ -290,8 +291,8 @@ class _Search:
             fits = False
         if not fits:
             raise self.refusal(
-                f"an observation is {' '.join(str(observation).split())[:80]}, which does not fit its "
-                f"space {' '.join(str(space).split())[:120]}"
+                f"an observation is {' '.join(str(observation).split())[:80]}, which is not in its space "
+                f"{' '.join(str(space).split())[:120]}"
             )
         return array
 
@@ -305,8 +306,8 @@ class _Search:
         most = max(map(len, values.values()))
         names = _listed(name for name, found in values.items() if len(found) == most)
         return (
-            f"{names} keeps changing; take a smaller one, set a limit (env.kwargs.max_episode_steps), or "
-            f"leave out what nothing depends on, e.g. env.ignore=[{names.split(',')[0]}]"
+            f"{names} keeps changing; use a smaller one, set a limit (env.kwargs.max_episode_steps), or "
+            f"ignore irrelevant attributes, e.g. env.ignore=[{names.split(',')[0]}]"
         )
 
     def compiled(self, limit: int | None) -> Mdp:
@@ -318,6 +319,11 @@ class _Search:
         limits = [each for each in (self._own_limit(terminated, truncated), limit) if each is not None]
         paid = terminated & (reward > 0)
         observations = [each.observation for each in self.states if each.observation is not None]
+        found = [each.place for each in self.states if each.place is not None]
+        panels, places = list(dict.fromkeys(facing for facing, _, _ in found)), None
+        if len(found) == len(self.states):
+            places = np.array([(panels.index(facing), row, column) for facing, row, column in found])
+            places[:, 1:] -= places[:, 1:].min(axis=0)  # without the walls around the room
         check_memory(f"env.id={self.name}: its own observations", sum(each.nbytes for each in observations))
         mdp = mdp_from_outcomes(
             self.name,
@@ -330,11 +336,13 @@ class _Search:
                 success=paid[:, :, None] if paid.any() else None,
             ),
             action_names=self._action_names(),
+            places=places,
+            panel_names=panels,
             max_episode_steps=min(limits, default=None),
             own_observation=np.stack(observations) if observations else None,
         )
         names = tuple(each.name for each in self.states)
-        without = f" without {', '.join(self.ignore)} as you said" if self.ignore else ""
+        without = f" without {', '.join(self.ignore)}, as you asked" if self.ignore else ""
         truth = f"enumerated, {mdp.num_states:,} states{without}"
         return replace(mdp, state_names=names if names[0] else (), truth=truth)
 
@@ -347,7 +355,7 @@ class _Search:
         limit = int(time[truncated & ~terminated].min())
         if ((truncated != (time >= limit)) & tried & ~terminated).any():
             raise self.refusal(
-                "it truncates some episodes earlier than others, which no step limit of the world says"
+                "it truncates some episodes earlier than others, so it has no single step limit"
             )
         return limit
 
@@ -439,6 +447,6 @@ class _Replay:
             left_out = ", ".join(self._search.ignore)
             depends = f"depends on {left_out}, which env.ignore leaves out, " if left_out else ""
             raise self._search.refusal(
-                f"after {self._steps} steps of an episode its {what} is not the enumerated one{shown}, so it "
-                f"{depends}is random, has state outside of its attributes, or a wrapper that changes it"
+                f"after {self._steps} steps of an episode its {what} is not the enumerated one{shown}, so "
+                f"it {depends}is random, has state outside its attributes, or has a wrapper that changes it"
             )

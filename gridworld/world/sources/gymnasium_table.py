@@ -40,8 +40,8 @@ def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> M
     refuse_transformed(env_id, env)
     if _differ(_table(env_id, env.unwrapped), _table(env_id, again.unwrapped)):
         raise InputError(
-            f"env.id={env_id}: has another table each time that it is made, so no exact truth is known; "
-            "give what it draws as env.kwargs, e.g. desc of a FrozenLake"
+            f"env.id={env_id}: has a different table each time it is made, so it cannot be solved exactly; "
+            "fix it by env.kwargs, e.g. desc of a FrozenLake"
         )
     mdp = compile_table(again.unwrapped, step_limit(env), env_id)
     env.close()
@@ -57,7 +57,7 @@ def compile_table(real: gym.Env[Any, Any], limit: int | None = None, name: str |
     called = name or (real.spec.id if real.spec is not None else type(real).__name__)
     mdp, table = _compiled(real, called, limit)
     if own := {"step", "reset"} & vars(real).keys():
-        raise InputError(f"{called}: its {own.pop()}() was replaced, so nothing exact is known of it")
+        raise InputError(f"{called}: its {own.pop()}() was replaced, so it cannot be solved exactly")
     is_gymnasiums = type(real).__module__.startswith("gymnasium.envs.")
     key = (type(real).step, type(real).reset, mdp.text()) if is_gymnasiums and name is None else None
     truth = _WALKED.get(key) or _check_steps(mdp, table, copied(real))
@@ -86,8 +86,8 @@ def _compiled(real: gym.Env[Any, Any], name: str, limit: int | None) -> tuple[Md
     is_fickle = known.panel_names and getattr(real, "fickle_passenger", False)
     if is_fickle and getattr(real, "fickle_probability", 1) > 0:
         raise InputError(
-            f"{name}: fickle_passenger=True changes the destination in a way that its table P does not have, "
-            "so no exact truth is known; leave it out"
+            f"{name}: fickle_passenger=True changes the destination in a way that its table P lacks, so it "
+            "cannot be solved exactly; leave it out"
         )
     return mdp, table
 
@@ -96,8 +96,8 @@ def _table(name: str, real: Any) -> Outcomes:
     """P and the start distribution as arrays; an outcome that a row does not have has probability 0."""
     if not has_table(real):
         raise InputError(
-            f"{name}: has no transition table P, so its truth cannot be read off; env=enumerated may fit, "
-            "which tries out what a deterministic environment does"
+            f"{name}: has no transition table P; if it is deterministic, env=enumerated can find its states "
+            "by trying all actions"
         )
     sizes = []
     for what in ("observation", "action"):
@@ -166,8 +166,8 @@ def _check_steps(mdp: Mdp, table: Outcomes, env: gym.Env[Any, Any]) -> str:
         raise InputError(f"{mdp.name}: cannot be stepped ({short_reason(error)})") from error
     if _differ(table, _table(mdp.name, real)):
         raise InputError(
-            f"{mdp.name}: its table P changes when it is reset or stepped, so no exact truth is known; must "
-            "stay what it is from when the environment was made"
+            f"{mdp.name}: its table P changes when it is reset or stepped, so it cannot be solved exactly; "
+            "it must not change"
         )
     if mistake is not None:
         raise mistake
@@ -224,7 +224,7 @@ def make_env(
             reason = f"the module {module} cannot be imported ({short_reason(error)})"
             missing = error.name if isinstance(error, ModuleNotFoundError) else None
             if missing and f"{module}.".startswith(f"{missing}."):
-                reason = f"there is no module {missing}; install it, or name its folder in PYTHONPATH"
+                reason = f"no module {missing}; install it, or add its folder to PYTHONPATH"
             raise InputError(f"env.id={str(env_id)[:80]}: {reason}") from None
     if registered.startswith(("MiniGrid-", "BabyAI-")):
         try:
@@ -236,8 +236,8 @@ def make_env(
         gym.spec(registered)
     except Exception as error:  # an id may name a module, which may raise anything
         raise InputError(
-            f"env.id={str(env_id)[:80]}: is not an environment that Gymnasium knows ({short_reason(error)}); "
-            "give a registered id, e.g. FrozenLake-v1"
+            f"env.id={str(env_id)[:80]}: is not registered with Gymnasium ({short_reason(error)}); give a "
+            "registered id, e.g. FrozenLake-v1"
         ) from None
     try:
         with np.errstate(all="ignore"):

@@ -98,8 +98,8 @@ class _Walker:
         if truncated and self._elapsed < (self.mdp.max_episode_steps or np.inf):
             self.check()
             raise InputError(
-                f"{self.mdp.name}: cuts its episodes by itself, which its table P does not have; must leave "
-                "that to the wrapper TimeLimit"
+                f"{self.mdp.name}: truncates its own episodes, which its table P does not show; leave that "
+                "to the wrapper TimeLimit"
             )
         return bool(terminated or truncated) or self._elapsed >= self._limit
 
@@ -232,9 +232,9 @@ class _Walker:
         size = int(counts[row].sum())
         which = int(np.abs(counts[row] - size * chance[row]).argmax())
         raise InputError(
-            f"{self.mdp.name}: leaves its own table: {names[row]} {which}, came {counts[row, which]:,.0f} "
-            f"times of {size:,}, its probability there is {chance[row, which]:.3g}, so no exact truth is "
-            "known; must start by initial_state_distrib and step by P alone"
+            f"{self.mdp.name}: does not follow its own table: {names[row]} {which}, occurred "
+            f"{counts[row, which]:,.0f} times in {size:,}, its probability there is "
+            f"{chance[row, which]:.3g}, so it cannot be solved exactly"
         )
 
     def _name(self, row: Any) -> str:
@@ -254,9 +254,9 @@ class _Walker:
             wrong = int(np.argmin(same.any(axis=1)))
             place = f"{state[wrong]}, action {action[wrong]} led to state {following[wrong]}"
             raise InputError(
-                f"{self.mdp.name}: leaves its own table: in state {place} with reward {reward[wrong]:g}"
-                f"{' and ended' if terminated[wrong] else ''}, which {self._name(row[wrong])} does not have, "
-                "so no exact truth is known; must step by P alone"
+                f"{self.mdp.name}: does not follow its own table: in state {place} with reward "
+                f"{reward[wrong]:g}{' and ended' if terminated[wrong] else ''}, which "
+                f"{self._name(row[wrong])} does not have, so it cannot be solved exactly"
             )
         column = self._column[row, same.argmax(axis=1)]
         np.add.at(self._counts, (row, column), 1)

@@ -34,24 +34,23 @@ A2C, KWARGS = "stable_baselines3.A2C", "+agent.arguments.policy_kwargs"
 @pytest.mark.parametrize(
     ("algorithm", "overrides", "words"),
     [
-        ("sb3_contrib.RecurrentPPO", "agent.policy=MlpLstmPolicy", "keeps a memory from step to step"),
-        ("sb3_contrib.ARS", "~agent.arguments.gamma", "has neither probabilities and values nor Q values"),
+        ("sb3_contrib.RecurrentPPO", "agent.policy=MlpLstmPolicy", "keeps memory between steps"),
+        (
+            "sb3_contrib.ARS",
+            "~agent.arguments.gamma",
+            "has neither action probabilities and values nor Q values",
+        ),
         ("stable_baselines3.SAC", "seed=0", "cannot be built: AssertionError: The algorithm only supports"),
         ("stable_baselines3.A3C", "seed=0", "agent.algorithm=stable_baselines3.A3C: must be the import path"),
         ("torch.nn.ReLU", "seed=0", "must be the import path of a BaseAlgorithm class"),
-        ("A2C", "seed=0", "agent.algorithm=A2C: must be the import path of a BaseAlgorithm class"),
         (A2C, "agent.policy=MlpLstmPolicy", "agent.policy=MlpLstmPolicy: stable_baselines3.A2C has MlpPol"),
         (A2C, "+agent.arguments.gama=1", "cannot be built: TypeError: A2C.__init__() got an unexpected key"),
         (A2C, "+agent.arguments.n_steps=many", "agent.arguments.n_steps=many: must be a number"),
         (A2C, "+agent.arguments.ent_coef=true", "agent.arguments.ent_coef=True: must be a number"),
-        (A2C, "+agent.arguments.ent_coef=abc", "agent.arguments.ent_coef=abc: must be a number"),
         (A2C, "agent.arguments.gamma=2", "agent.arguments.gamma=2: must be from 0 to 1"),
-        (A2C, "+agent.arguments.n_steps=0", "agent.arguments.n_steps=0: must be at least 1"),
         (A2C, "+agent.arguments.ent_coef=nan", "agent.arguments.ent_coef=nan: must be at least 0"),
-        ("sb3_contrib.TRPO", "+agent.arguments.batch_size=-1", "batch_size=-1: must be at least 1"),
         ("sb3_contrib.QRDQN", "+agent.arguments.train_freq=0", "train_freq=0: must be from 1 to 100000"),
         (A2C, "+agent.arguments.seed=2", "agent.arguments.seed: is a setting of the run"),
-        (A2C, "+agent.arguments.learning_rate=fast", "agent.arguments.learning_rate=fast: must be a numb"),
         (A2C, "+agent.arguments._init_setup_model=false", "cannot be built: AttributeError: "),
     ],
 )
@@ -76,7 +75,7 @@ def test_ones_own_class_in_ones_own_yaml(tmp_path: Path, monkeypatch: pytest.Mon
     assert settings["arguments"] == {"caution": 0.9, "gamma": 0.9}
 
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(InputError, match=r"algorithm=my_agents\.Mine is from none of"):
+    with pytest.raises(InputError, match=r"algorithm=my_agents\.Mine is not from one of"):
         SavedRun(tmp_path / "out").snapshot()
     assert SavedRun(tmp_path / "out", trust=True).snapshot().greedy.shape == (30,)
 
@@ -107,16 +106,14 @@ def outcome(folder: Path, *words: str) -> str:
         (
             "dqn",
             "agent.policy_kwargs.activation_fn=torch.nn.Module",
-            "agent=dqn: DQN cannot be asked: NotImplementedError: Module [Module] is missing the required "
-            '"forward" function; look at agent.policy_kwargs.activation_fn=torch.nn.Module',
+            "agent=dqn: DQN cannot be evaluated: NotImplementedError: Module [Module] is missing the "
+            'required "forward" function; check agent.policy_kwargs.activation_fn=torch.nn.Module',
         ),
         ("dqn", "agent.policy_kwargs.activation_fn=torch.nn.ModuleList", "torch.nn.ModuleList"),
         ("dqn", "agent.policy_kwargs.activation_fn=torch.nn.Dropout", ""),
         ("a2c", f"{KWARGS}.optimizer_class=torch.optim.LBFGS", "torch.optim.LBFGS"),
         ("a2c", f"{KWARGS}.optimizer_class=torch.optim.Adafactor", ""),
-        ("ppo", "agent.ent_coef=1e307", "training diverged at update 0"),
         ("ppo", "agent.learning_rate=1e307", "training diverged at update"),
-        ("a2c", "+agent.arguments.vf_coef=1e307", "training diverged at update"),
         ("dqn", "agent.policy_kwargs.activation_fn=own_modules.Drawn", "DQN does not always give the same"),
         (
             "a2c",

@@ -16,7 +16,6 @@ from helpers.resuming import begin, differences, go_on, left_behind, rows, stopp
 from helpers.support import SHORT, configure
 
 from gridworld.agents.sb3.model_file import read_weights
-from gridworld.agents.tabular import check as check_tabular
 from gridworld.config.recipe_file import overrides
 from gridworld.errors import InputError
 from gridworld.restore.resume import open_unfinished
@@ -25,12 +24,11 @@ from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.reader import check_free, read_run
 
 MODULE = """
-import gridworld
 import numpy as np
 import torch
 from stable_baselines3 import A2C, DQN
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
 CALLS = []
@@ -70,10 +68,6 @@ class Recording(BaseCallback):
         return self.num_timesteps < 300
     def _on_training_end(self):
         CALLS.append("end")
-
-class Sampling(EvalCallback):
-    def __init__(self, **settings):
-        super().__init__(gridworld.make_vec_env("classic", n_envs=1), verbose=0, **settings)
 
 class Failing(Recording):
     def __init__(self):
@@ -115,7 +109,6 @@ class SavedShifting(Shifting):
     def set_state(self, state):
         self.shift = state["shift"]
 
-class Adam(torch.optim.Adam): pass
 class Remembering(ReplayBuffer): pass
 """
 LESS = ["recording.frames=false", "recording.gif=false"]
@@ -131,12 +124,7 @@ EVERY = "{_target_: stable_baselines3.common.callbacks.EveryNTimesteps, n_steps:
 SILENT = {
     "SilentA2C": ["own_code.SilentA2C"],
     "Shifting": ["stable_baselines3.A2C", f"{LAYER}own_code.Shifting"],
-    "Adam": ["stable_baselines3.A2C", "+agent.arguments.policy_kwargs.optimizer_class=own_code.Adam"],
     "Remembering": ["stable_baselines3.DQN", "+agent.arguments.replay_buffer_class=own_code.Remembering"],
-    "Sampling": [
-        "stable_baselines3.A2C",
-        "callbacks=[{_target_: own_code.Sampling, eval_freq: 50, n_eval_episodes: 2}]",
-    ],
     "Recording": ["stable_baselines3.A2C", f"callbacks=[{EVERY}{{_target_: own_code.Recording}}}}]"],
 }
 
@@ -168,7 +156,7 @@ def test_what_does_not_trains_without_checkpoints(
 ) -> None:
     words = [*any_class(*SILENT[name]), *LESS]
     begin(tmp_path / "run", *words, "checkpoint.every=100")
-    line = f"checkpoints: none, since own_code.{name} does not define get_state and set_state\n"
+    line = f"no checkpoints, since own_code.{name} does not define get_state and set_state\n"
     assert capsys.readouterr().err.count(line) == 1
     assert line in (tmp_path / "run" / "train.log").read_text()
     assert Checkpoints(tmp_path / "run").files() == []
@@ -213,7 +201,7 @@ def test_it_is_called_as_sb3_calls_it_and_may_end_training(
     told = "callbacks[0]: own_code.Recording stopped training after 304 steps\n"
     assert told in capsys.readouterr().err
     assert told in (tmp_path / "run" / "train.log").read_text()
-    with pytest.raises(InputError, match=r"holds a run already; choose another folder$"):
+    with pytest.raises(InputError, match=r"contains a run already; choose another folder$"):
         check_free(tmp_path / "run")  # it has no checkpoint to go on from
 
 
@@ -259,7 +247,7 @@ OWN = "{_target_: own_code."
         ("[{_target_: Stirring}]", "must be a mapping of _target_, the import path"),
         (f"[{OWN}Stiring}}]", r"callbacks\[0\]\._target_=own_code\.Stiring: must be the import path of"),
         ("[{_target_: torch.nn.ReLU}]", "must be the import path of a BaseCallback class"),
-        ("[{_target_: nowhere.Stirring}]", "there is no module nowhere; is the folder"),
+        ("[{_target_: nowhere.Stirring}]", "no module nowhere; is its folder"),
         (f"[{OWN}Stirring, every: 3, evry: 3}}]", "got an unexpected keyword argument 'evry'"),
         (f"[{OWN}Failing}}]", r"callbacks\[0\]: own_code\.Failing cannot be built: .*no server"),
     ],
@@ -271,5 +259,6 @@ def test_mistakes_are_found_before_training(callbacks: str, told: str, tmp_path:
 
 
 def test_a_tabular_agent_has_none() -> None:
-    with pytest.raises(InputError, match=r"^callbacks: are Stable-Baselines3's, agent=sarsa calls none"):
-        check_tabular(configure("agent=sarsa", STIRRING))
+    config = configure("agent=sarsa", STIRRING)
+    with pytest.raises(InputError, match=r"^callbacks: agent=sarsa does not call Stable-Baselines3's"):
+        config.agent.check(config)

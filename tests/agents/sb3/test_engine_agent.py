@@ -13,21 +13,16 @@ from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
 
 import gridworld
-from gridworld.agents import Agent, TrainingContext, family
-from gridworld.agents.sb3 import check
+from gridworld.agents import Agent
 from gridworld.agents.sb3.agent import ACTIVATIONS, EngineAgent, SB3Agent
 from gridworld.agents.sb3.callbacks import FallingSetting
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.training.setup import make_context
 
 
 def built(*words: str, log: Any = None) -> Agent:
     config = configure(*words)
-    mdp = config.env.compile()
-    observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
-    context: TrainingContext = make_context(config, mdp, observation, log)
-    return family(config.agent).build(config.agent, context)
+    return config.agent.build(make_context(config, config.env.compile(), log))
 
 
 SB3S = {"dqn": DQN, "ppo": PPO, "a2c": A2C, "qrdqn": QRDQN, "trpo": TRPO}
@@ -73,7 +68,7 @@ def test_what_it_does_not_know_learns_in_sb3s_loop_and_a_line_says_why(
         agent = built("agent=dqn", setting)
         assert type(agent) is SB3Agent
         assert type(agent.model) is DQN
-    assert f"engine: stock, since the tabulated one does not cover {setting}" in capsys.readouterr().err
+    assert f"engine: stock, since the tabulated engine does not support {setting}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -99,9 +94,10 @@ def test_a_class_with_its_arguments(agent: str, capsys: pytest.CaptureFixture[st
     assert capsys.readouterr().err == ""
     unknown = "agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU"
     assert type(built(f"agent={agent}", f"+{unknown}")) is SB3Agent
-    assert f"engine: stock, since the tabulated one does not cover {unknown}" in capsys.readouterr().err
+    assert f"engine: stock, since the tabulated engine does not support {unknown}" in capsys.readouterr().err
+    config = configure(f"agent={agent}", "agent.engine=fast")
     with pytest.raises(InputError, match=r"agent\.engine=fast: must be tabulated or stock"):
-        check(configure(f"agent={agent}", "agent.engine=fast"))
+        config.agent.check(config)
 
 
 @pytest.mark.parametrize("kind", ACTIVATIONS)

@@ -101,13 +101,13 @@ def test_it_learns_from_pixels(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "arguments", "words"),
     [
-        (FourierFeatures, [spaces.Discrete(3)], "must see coordinates, a Box (d,); Discrete(3) is not"),
+        (FourierFeatures, [spaces.Discrete(3)], "needs coordinates, a Box of shape (d,), not Discrete(3)"),
         (FourierFeatures, [PLANE, [3, -1]], "orders=[3, -1]: must be 2 whole numbers"),
         (FourierFeatures, [PLANE, [[1, 2], 3]], "orders=[[1, 2], 3]: must be 2 whole numbers"),
         (FourierFeatures, [PLANE, [99, 99]], "orders=[99, 99]: 10000 features; at most 4096"),
-        (AgentByColour, [PLANE], "must see images, (channels, height, width)"),
+        (AgentByColour, [PLANE], "needs images, (channels, height, width)"),
         (AgentByColour, [IMAGE, 10], "from 1 to the image's 8 pixels"),
-        (PixelCNN, [PLANE], "PixelCNN: must see images, (channels, height, width)"),
+        (PixelCNN, [PLANE], "PixelCNN: needs images, (channels, height, width)"),
         (PixelCNN, [IMAGE, True], "PixelCNN: cell_size=True: must be from 1"),
     ],
 )

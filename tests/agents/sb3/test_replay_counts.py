@@ -108,7 +108,9 @@ def test_sb3s_version_samples_and_goes_on_from_its_state() -> None:
     assert (expected.total(), buffer.size(), buffer.counts.sum()) == (1920, 0, 0)
     buffer.set_state(state)
     assert kept(buffer) == expected
-    with pytest.raises(InputError, match="optimize_memory_usage=true: ReplayCounts has each transition once"):
+    with pytest.raises(
+        InputError, match="optimize_memory_usage=true: ReplayCounts stores each transition once"
+    ):
         ReplayCounts(1, model.observation_space, model.action_space, optimize_memory_usage=True)
 
 

@@ -50,7 +50,7 @@ def test_spaces_attributes_and_monitoring() -> None:
     assert envs.get_attr("max_episode_steps", [0, 2]) == [100, 100]
     assert envs.env_is_wrapped(Monitor) == [True] * 3
     assert not envs.has_attr("no_such_thing")
-    with pytest.raises(InputError, match="no methods of their own"):
+    with pytest.raises(InputError, match="no individual methods"):
         envs.env_method("reset")
     with pytest.raises(InputError, match="SameStep"):
         GridWorldVecEnv(GridWorldVectorEnv(2), make_observation(envs.envs.mdp, "one_hot"))

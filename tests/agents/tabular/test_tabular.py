@@ -12,7 +12,6 @@ from helpers.support import NO_FILES, ROOT, SHORT, train_in
 
 from gridworld import GridWorldVectorEnv, InputError
 from gridworld.agents import Agent, TrainingContext
-from gridworld.agents.tabular import build
 from gridworld.agents.tabular.algorithms import (
     ExpectedSarsaConfig,
     QLearningConfig,
@@ -39,7 +38,7 @@ def seat_of(num_envs: int = 1, seed: int = 0, write: Any = None, **world: Any) -
 
 
 def trained(config: TabularControlConfig, steps: int, context: TrainingContext) -> TabularControl:
-    agent = build(config, context)
+    agent = config.build(context)
     assert isinstance(agent, TabularControl)
     agent.learn(steps, lambda done: True)
     return agent
@@ -160,7 +159,7 @@ def test_epsilon_is_spread_over_all_actions_and_the_rest_over_the_best() -> None
 
 @pytest.mark.parametrize("schema", CONTROL)
 def test_beliefs_are_the_table_and_the_policy_it_acts_with(schema: type[TabularControlConfig]) -> None:
-    agent = build(schema(exploration_final_eps=0.1), seat_of(4))
+    agent = schema(exploration_final_eps=0.1).build(seat_of(4))
     assert np.array_equal(agent.snapshot().sampled, np.full((30, 4), 0.25))
     seen = []
     agent.learn(4000, lambda done: seen.append(agent.snapshot()) is not None or done < 2000)
@@ -191,8 +190,7 @@ def test_the_curves_are_means_over_the_last_episodes() -> None:
 
     def watched(actions: Any) -> Any:
         result = advance(actions)
-        if (ended := result[4]) is not None:
-            episodes.append((ended.returns[0], ended.lengths[0]))
+        episodes.extend(zip(result.returns, result.lengths, strict=True))
         return result
 
     context.envs.advance = watched  # type: ignore[method-assign]
@@ -218,15 +216,15 @@ def test_value_iteration_refuses_a_discount_without_a_finite_optimum(tmp_path: P
     pocket = tmp_path / "pocket.txt"
     pocket.write_text("S.#.\n.G#.\n")
     config = ValueIterationConfig(gamma=1.0)
-    assert np.isfinite(build(config, seat_of(layout=pocket)).snapshot().values).all()
+    assert np.isfinite(config.build(seat_of(layout=pocket)).snapshot().values).all()
     with pytest.raises(InputError, match=r"agent\.gamma=1\.0: from row 1, column 4 no end can be reached"):
-        build(config, seat_of(layout=pocket, step_reward=-1.0))
-    with pytest.raises(InputError, match="may grow without end"):
-        build(config, seat_of(layout=pocket, step_reward=1.0))
+        config.build(seat_of(layout=pocket, step_reward=-1.0))
+    with pytest.raises(InputError, match="may be infinite"):
+        config.build(seat_of(layout=pocket, step_reward=1.0))
 
 
 def saved(config: TabularConfig, path: Path) -> Agent:
-    agent = build(config, seat_of(8))
+    agent = config.build(seat_of(8))
     agent.learn(2000, lambda done: True)
     path.write_bytes(agent.model_file())
     return agent
@@ -235,7 +233,7 @@ def saved(config: TabularConfig, path: Path) -> Agent:
 @pytest.mark.parametrize("schema", [*CONTROL, ValueIterationConfig])
 def test_a_model_file_gives_back_the_very_beliefs(schema: type[TabularConfig], tmp_path: Path) -> None:
     agent = saved(schema(), tmp_path / "model.zip")
-    again = build(schema(), seat_of(8))
+    again = schema().build(seat_of(8))
     again.load(tmp_path / "model.zip")
     for name, value in vars(agent.snapshot()).items():
         assert np.array_equal(value, getattr(again.snapshot(), name)), name
@@ -246,7 +244,7 @@ def test_a_model_file_gives_back_the_very_beliefs(schema: type[TabularConfig], t
     [
         ("q", np.zeros((3, 4)), r"q is float64 \(3, 4\), it must be float64 \(30, 4\)"),
         ("q", np.zeros((30, 4), dtype=np.float32), "q is float32"),
-        ("q", np.full((30, 4), np.nan), "q holds numbers that are not finite"),
+        ("q", np.full((30, 4), np.nan), "q contains numbers that are not finite"),
         ("q", np.array([{}] * 30), "Object arrays cannot be loaded"),
         ("exploration_rate", np.array(1.5), r"exploration_rate=1\.5: must be from 0 to 1"),
         ("algorithm", np.array("sarsa"), "not a model of q_learning but of sarsa"),

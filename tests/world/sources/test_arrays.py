@@ -174,8 +174,8 @@ def test_everything_optional(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "told"),
     [
-        ({"start": None}, "has no start, must hold next_state, reward, terminated, start"),
-        ({"nonsense": [1.0]}, "nonsense is not an array of a world; apart from what is needed it may hold"),
+        ({"start": None}, "has no start, must contain next_state, reward, terminated, start"),
+        ({"nonsense": [1.0]}, "nonsense is not an array of a world; optional are"),
         ({"reward": [0.0, 1.0]}, r"reward has shape \(2,\), next_state has \(2, 2, 1\)"),
         ({"reward": [["a", "b"], ["a", "b"]]}, "reward is <U1 .* must be an array of numbers"),
         ({"terminated": [[0, 0], [0, 1]]}, "terminated is int64 .* must be an array of booleans"),
@@ -275,7 +275,7 @@ def at(where, value):
     ("changed", "told"),
     [
         ({"format": np.array("another")}, "not a world of this version"),
-        ({"start": None}, "not a world, must hold"),
+        ({"start": None}, "not a world, must contain"),
         ({"next_state": at((0, 0, 0), 99)}, "next_state of state 0, action 0 is 99"),
         ({"next_state": np.zeros((3, 2), np.int32)}, "next_state is int32"),
         ({"next_state": np.zeros((3, 2, 3))}, "next_state is float64"),
@@ -287,9 +287,9 @@ def at(where, value):
         ({"number": at(0, 99)}, "state 0 has a number"),
         ({"places": at((0, 0), -5)}, "state 0 has a place below"),
         ({"places": at((0, 1), 10**8)}, "pictures have room"),
-        ({"goal": at(0, True)}, "state 0 is a goal and not terminal"),
-        ({"absorbing": at(0, True)}, "state 0 is absorbing and goes on"),
-        ({"terminal": at(0, True)}, "state 0 is terminal and not absorbing"),
+        ({"goal": at(0, True)}, "state 0 is a goal but not terminal"),
+        ({"absorbing": at(0, True)}, "state 0 is absorbing, but has a successor"),
+        ({"terminal": at(0, True)}, "state 0 is terminal but not absorbing"),
         ({"action_names": np.array(["a", "b", "c"])}, "next_state is"),
         ({"action_names": np.array(["a", "\x1b[1m"])}, "action_names is"),
         ({"name": np.array(3)}, "name is '3'"),
@@ -315,7 +315,7 @@ def test_a_world_that_would_grow_is_refused():
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("start.npy", b"0" * 10**6)
-    with pytest.raises(InputError, match="its members are larger than itself"):
+    with pytest.raises(InputError, match="its members are larger than the file"):
         world_from_bytes(content.getvalue(), "world.npz")
 
 
@@ -376,7 +376,9 @@ def drawn(length=4, seed=None):
 
 
 def test_a_function_that_draws_its_world_needs_a_seed():
-    with pytest.raises(InputError, match=r"^env.builder=drawn: makes another world each time .* env.kwargs"):
+    with pytest.raises(
+        InputError, match=r"^env.builder=drawn: returns a different world each time .* env.kwargs"
+    ):
         build(drawn)
     assert build(drawn, {"seed": 3}).text() == build(drawn, {"seed": 3}).text()
 
@@ -394,7 +396,7 @@ def test_the_three_things_that_a_function_may_return():
     ("builder", "kwargs", "told"),
     [
         ("make", None, "env.builder=make: must be the import path of a function"),
-        ("no_such_module.make", None, "env.builder=no_such_module.make: there is no module no_such_module"),
+        ("no_such_module.make", None, "env.builder=no_such_module.make: no module no_such_module"),
         ("gridworld.world.nothing", None, "env.builder=gridworld.world.nothing: must be the import path"),
         ("gridworld.ENV_ID", None, "env.builder=gridworld.ENV_ID: must be the import path"),
         (3, None, "env.builder=3: must be"),

@@ -195,7 +195,7 @@ def test_any_deterministic_environment(variant: str, limit: int) -> None:
 def test_a_step_count_that_is_left_out(variant: str, limit: int | None) -> None:
     mdp = enumerate_env("Corridor-v0", {"variant": variant, "limit": limit or 0}, ignore=["steps"])
     assert (mdp.num_states, mdp.max_episode_steps, mdp.action_names) == (CELLS, limit, ("0", "1"))
-    assert mdp.truth == "enumerated, 5 states without steps as you said"
+    assert mdp.truth == "enumerated, 5 states without steps, as you asked"
     assert mdp.goal.tolist() == [False] * 4 + [True]
     assert mdp.next_state[:, :, 0].tolist() == [[0, 1], [0, 2], [1, 3], [2, 4], [4, 4]]
     assert (mdp.own_observation is None) == (variant == "text")
@@ -239,7 +239,7 @@ def test_states_beyond_the_step_limit_that_have_an_end_are_found() -> None:
     [
         ("Corridor-v0", {"variant": "random"}, "draws a random number"),
         ("Corridor-v0", {"variant": "global"}, "draws a random number"),
-        ("Corridor-v0", {"variant": "layout"}, "a reset leads to another state with another seed"),
+        ("Corridor-v0", {"variant": "layout"}, "a reset does not always lead to the same state"),
         ("ShortCorridor-v0", {"variant": "hidden"}, "a step changes what is outside of its attributes"),
         ("Corridor-v0", {"variant": "endless"}, "more than 300 states .* since its past keeps changing"),
         ("Corridor-v0", {}, r"since its steps keeps changing; .* e.g. env.ignore=\[steps\]"),
@@ -248,10 +248,10 @@ def test_states_beyond_the_step_limit_that_have_an_end_are_found() -> None:
         ("Corridor-v0", {"variant": "fails"}, "a step with action 0 fails: no third cell"),
         ("Corridor-v0", {"size": 3}, "unexpected keyword argument 'size'"),
         ("DoubledCorridor-v0", {"limit": 20}, r"its reward is not .* \(2.0, enumerated as 1.0\)"),
-        ("MiniGrid-FourRooms-v0", {}, "a reset leads to another state"),
-        ("MiniGrid-Empty-Random-6x6-v0", {}, "a reset leads to another state"),
-        ("FrozenLake-v1", {}, "take env=gymnasium"),
-        ("Taxi-v4", {}, "another seed .* take env=gymnasium"),
+        ("MiniGrid-FourRooms-v0", {}, "a reset does not always lead to the same state"),
+        ("MiniGrid-Empty-Random-6x6-v0", {}, "a reset does not always lead to the same state"),
+        ("FrozenLake-v1", {}, "use env=gymnasium"),
+        ("Taxi-v4", {}, "the same state .* use env=gymnasium"),
         ("Pendulum-v1", {}, r"its actions are Box"),
         ("NoSuchWorld-v0", {}, "doesn't exist"),
     ],
@@ -303,7 +303,7 @@ def test_what_cannot_be_copied_or_is_left_to_chance_is_refused(what: str) -> Non
 @pytest.mark.parametrize("variant", NO_OBSERVATIONS)
 def test_an_observation_must_fit_its_space(variant: str) -> None:
     with pytest.raises(
-        InputError, match=r"^env.id=Corridor-v0: an observation is .*not fit its space"
+        InputError, match=r"^env.id=Corridor-v0: an observation is .*not in its space"
     ) as refused:
         enumerate_env("Corridor-v0", {"variant": variant})
     assert "\n" not in str(refused.value)

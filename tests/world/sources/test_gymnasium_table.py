@@ -145,7 +145,7 @@ def redrawn(self, **kwargs):
     ("method", "other", "told"),
     [
         ("reset", redrawn, "its table P changes when it is reset"),
-        ("step", lambda self, a: (*TableEnv.step(self, a)[:3], True, {}), "cuts its episodes by itself"),
+        ("step", lambda self, a: (*TableEnv.step(self, a)[:3], True, {}), "truncates its own episodes"),
         ("reset", lambda self, **_: (1, {}), "started in state 1, which has no probability"),
         ("step", lambda self, action: 1 / 0, "cannot be stepped .ZeroDivisionError: division"),
         ("reset", lambda self, **_: (None, {}), "shows 'None', must show the number of a state"),
@@ -188,7 +188,7 @@ ROW = [(1.0, 0, 0.0, False)]
 @pytest.mark.parametrize(
     ("changed", "told"),
     [
-        ({"P": None}, "has no transition table P, .*env=enumerated may fit"),
+        ({"P": None}, "has no transition table P; .*env=enumerated can find"),
         ({"P": {0: {0: ROW, 1: ROW}}}, "P must have for each of 2 states and 2 actions a list"),
         ({"P": [[ROW, ROW], [ROW]]}, "P must have"),
         ({"P": [[ROW, ROW], [ROW, []]]}, "P must have"),
@@ -214,18 +214,22 @@ def test_a_table_that_is_none_is_refused(changed, told):
 @pytest.mark.parametrize(
     ("env_id", "kwargs", "told"),
     [
-        ("FrozenLak-v1", {}, "env.id=FrozenLak-v1: is not an environment .*Did you mean: `FrozenLake`"),
+        (
+            "FrozenLak-v1",
+            {},
+            "env.id=FrozenLak-v1: is not registered with Gymnasium .*Did you mean: `FrozenLake`",
+        ),
         ("FrozenLake-v9", {}, "env.id=FrozenLake-v9: .*`v1`"),
         ("no such id", {}, "env.id=no such id: "),
         (3, {}, "env.id=3: "),
-        ("no_module.here:Any-v0", {}, "env.id=no_module.here:Any-v0: there is no module no_module; install"),
-        (":Any-v0", {}, "env.id=:Any-v0: is not an environment"),
-        ("gymnasium:Lake-v1", {}, "env.id=gymnasium:Lake-v1: is not an environment"),
+        ("no_module.here:Any-v0", {}, "env.id=no_module.here:Any-v0: no module no_module; install"),
+        (":Any-v0", {}, "env.id=:Any-v0: is not registered with Gymnasium"),
+        ("gymnasium:Lake-v1", {}, "env.id=gymnasium:Lake-v1: is not registered with Gymnasium"),
         ("gridworld:GridWorld-v0", {}, "gridworld:GridWorld-v0: has no transition table P"),
         ("CartPole-v1", {}, "CartPole-v1: has no transition table P.*env=enumerated"),
         ("FrozenLake-v1", {"is_slipery": True}, "env.kwargs={is_slipery: True}: .*argument 'is_slipery'"),
         ("FrozenLake-v1", {"map_name": "9x9"}, "env.kwargs={map_name: 9x9}: FrozenLake-v1 cannot be made"),
-        ("FrozenLake-v1", {"map_name": None}, "another table each time that it is made"),
+        ("FrozenLake-v1", {"map_name": None}, "a different table each time it is made"),
         ("FrozenLake-v1", {"desc": ["FF", "FG"]}, "start is .*must be probabilities"),
         ("Taxi-v4", {"fickle_passenger": True}, "Taxi-v4: fickle_passenger=True changes the destination"),
         ("Taxi-v4", {"render_mode": "human"}, "env.kwargs: render_mode=human is not part"),
@@ -251,7 +255,7 @@ def test_an_id_may_name_the_module_that_registers_it(tmp_path, monkeypatch):
 
 def test_a_walk_alone_finds_a_fickle_passenger(monkeypatch):
     monkeypatch.setattr(gymnasium_table, "known_env", lambda env: None)
-    with pytest.raises(InputError, match=re.escape("Taxi-v4: leaves its own table: in state")):
+    with pytest.raises(InputError, match=re.escape("Taxi-v4: does not follow its own table: in state")):
         compile_gymnasium("Taxi-v4", {"fickle_passenger": True})
 
 

@@ -182,7 +182,7 @@ LIES = {
 @pytest.mark.parametrize("kind", LIES)
 def test_what_is_not_the_table_is_found(kind: str) -> None:
     made, told = LIES[kind]
-    with pytest.raises(InputError, match=f"^{made.__name__}: leaves its own table: .*{told}"):
+    with pytest.raises(InputError, match=f"^{made.__name__}: does not follow its own table: .*{told}"):
         compile_table(made(), 150)
 
 
