@@ -351,7 +351,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {  # what makes an environme
     "a grid that is asked by another way":
         (own(gridworld.GridWorldEnv, mdp=property(lambda self: self._mdp)), _STEP),
     "copies with another function of a library":
-        (lambda: DummyVecEnv([lambda k=k: paid_by(constant(k))(lake()) for k in (1, -1)]), "a different task"),
+        (lambda: DummyVecEnv([lambda k=k: paid_by(constant(k))(lake()) for k in (1, -1)]), "different task"),
     "what is no wrapper": (Delegating, _ENV),
     "an action that is a float":
         (lambda: wrappers.TransformAction(lake(), float, spaces.Discrete(4)), _ENV),
