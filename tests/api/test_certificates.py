@@ -376,7 +376,7 @@ def test_a_class_whose_step_is_replaced_is_compared_anew(monkeypatch: pytest.Mon
     gridworld.evaluate(BEST, lake())
     step = FrozenLakeEnv.step
     monkeypatch.setattr(FrozenLakeEnv, "step", lambda self, action: step(self, (action + 1) % 4))
-    with pytest.raises(InputError, match="leaves its own table"):
+    with pytest.raises(InputError, match="does not follow its own table"):
         gridworld.evaluate(BEST, lake())
 
 
