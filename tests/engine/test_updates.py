@@ -256,7 +256,10 @@ def test_only_the_states_within_the_step_limit_learn(algorithm: Any, monkeypatch
     nets: Any = whole.population.networks
     assert nets.weights.shape[1] < nets.whole().shape[1]
     unmet = np.delete(np.arange(30), met)
-    firsts = [(net[0].weight, before[0].weight) for net, before in zip(whole.nets, made.nets, strict=True)]
+    firsts = [
+        (net[0].weight, before[0].weight)
+        for net, before in zip(whole.network.layers, made.network.layers, strict=True)
+    ]
     for first, before in firsts:
         assert torch.equal(first[:, unmet], before[:, unmet])
         assert not torch.equal(first[:, met], before[:, met])

@@ -207,7 +207,7 @@ def test_value_iteration_refuses_a_discount_without_a_finite_optimum(tmp_path: P
     pocket.write_text("S.#.\n.G#.\n")
     config = ValueIterationConfig(gamma=1.0)
     assert np.isfinite(config.build(seat_of(layout=pocket)).snapshot().values).all()
-    with pytest.raises(InputError, match=r"agent\.gamma=1\.0: from row 1, column 4 no end can be reached"):
+    with pytest.raises(InputError, match=r"agent\.gamma=1\.0: no end can be reached from row 1, column 4"):
         config.build(seat_of(layout=pocket, step_reward=-1.0))
     with pytest.raises(InputError, match="may be infinite"):
         config.build(seat_of(layout=pocket, step_reward=1.0))
