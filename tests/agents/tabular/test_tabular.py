@@ -27,7 +27,6 @@ from gridworld.agents.tabular.td_control import (
     update,
 )
 from gridworld.envs.observations import make_observation
-from gridworld.world.solver import value_iteration
 
 CONTROL = [QLearningConfig, SarsaConfig, ExpectedSarsaConfig]
 
@@ -170,15 +169,6 @@ def test_beliefs_are_the_table_and_the_policy_it_acts_with(schema: type[TabularC
     assert np.array_equal(snapshot.greedy, snapshot.q.argmax(axis=1))
     followed = snapshot.sampled if schema is not QLearningConfig else np.eye(4)[snapshot.greedy]
     np.testing.assert_allclose(snapshot.values, (followed * snapshot.q).sum(axis=1), atol=1e-15)
-
-
-def test_q_learning_with_a_decaying_step_size_converges_to_q_star() -> None:
-    config = QLearningConfig(gamma=0.9, learning_rate=1, learning_rate_power=0.8, exploration_final_eps=1)
-    context = seat_of(512, slip=0.1)
-    agent = trained(config, 1_000_000, context)
-    mdp = context.envs.mdp
-    assert agent.visits[~mdp.terminal].min() > 0  # all of them are reachable
-    assert np.abs(agent.q - value_iteration(mdp, 0.9).q)[~mdp.terminal].max() < 0.1
 
 
 def test_the_curves_are_means_over_the_last_episodes() -> None:
