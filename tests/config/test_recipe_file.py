@@ -180,7 +180,7 @@ def test_a_study_whose_recipe_is_elsewhere_is_refused(tmp_path: Path) -> None:
 
 REFUSED = {
     "hydra: {run: {dir: evil}}": ("hydra.run.dir=out", "winner.yaml: has an unknown key 'hydra'"),
-    "agent: {n_steps: 3}": ("-m agent=q_learning,sarsa", "'agent.n_steps': Key 'n_steps' not in"),
+    "agent: {n_steps: 3}": ("-m agent=q_learning,sarsa", "agent.n_steps: no such setting in QLearningConfig"),
     "defaults: [{override /agent: mine}]": ("seed=1", "agent=mine: no such choice"),
     "evaluation: {stop_after: often}": ("seed=1", "'often' of type 'str' could not be converted to Integer"),
     "env: {slip: {a: 1}}": ("seed=1", "slip"),
