@@ -56,6 +56,8 @@ def test_scales_run_from_end_to_end_in_order_of_lightness() -> None:
         assert steps.sum() > 120
     values = np.array([-2.0, 0.0, 2.0, np.inf])
     assert np.array_equal(linear(VIRIDIS, values).colours(values), VIRIDIS[[0, 64, 127, 127]])
+    above = np.array([1.0, 2.0])
+    assert np.array_equal(linear(ORANGES, above, low=0).colours(above), ORANGES[[64, 127]])
     logarithmic = counting(BLUES, np.array([0, 1, 10, 100]))
     assert np.array_equal(logarithmic.colours(np.array([1.0, 10, 100])), BLUES[[0, 64, 127]])
     assert not counting(BLUES, np.array([0, 5, 99])).logarithmic
