@@ -222,7 +222,7 @@ def _run_command(name: str, words: Sequence[str], progress: bool) -> None:
     if is_stopped:
         raise KeyboardInterrupt("stopped; the same call with this folder does the rest")
     if errors := [found[1] for found in map(_ERROR.match, lines) if found]:
-        raise InputError(errors[-1])
+        raise InputError(re.sub(r"hydra\.sweep\.dir|tune\.folder", "folder", errors[-1]))
     if process.returncode and not progress:
         print(*lines, sep="", end="", file=sys.stderr)
     if process.returncode not in (0, 1):

@@ -100,11 +100,6 @@ class Player:
         """The player's name, steps and return, and the optimum."""
         return f"{self.name}: {self._taken()}, return {self.value:.4g}, optimum {self.optimum:.4g}"
 
-    def advice(self) -> str:
-        """The optimal actions here."""
-        mdp, optimal = self.evaluator.mdp, self.evaluator.solution.optimal[self.state]
-        return f"optimal here: {' or '.join(np.array(mdp.action_names)[optimal].tolist())}"
-
     def verdict(self) -> str:
         """How the finished episode compares with the optimum."""
         mdp, missing = self.evaluator.mdp, self.optimum - self.value
@@ -155,11 +150,6 @@ class Game:
             self.person.step(action)
             self.players[-1].act()
 
-    def tick(self) -> None:
-        """Let the agent take a step if the person's episode is over."""
-        if self.person.over:
-            self.players[-1].act()
-
     def press(self, key: str) -> bool:
         """Do what the key of this name does; whether the game continues."""
         if key == "r":
@@ -181,10 +171,7 @@ class Game:
 def _keys(mdp: Mdp) -> dict[str, int]:
     """The actions by the names of their keys: arrows for moves, digits for the others."""
     arrows = {word: key for key, words in _ARROWS.items() for word in words.split()}
-    moves: dict[str, int] = {}
-    for action, name in enumerate(mdp.action_names):
-        if name in arrows:
-            moves.setdefault(arrows[name], action)
+    moves = {arrows[name]: action for action, name in enumerate(mdp.action_names) if name in arrows}
     others = [action for action in range(mdp.num_actions) if action not in moves.values()]
     if len(others) > 9:
         raise InputError(f"{mdp.name}: has {mdp.num_actions} actions, more than there are keys for")
@@ -196,7 +183,9 @@ def draw(game: Game, cell_size: int) -> Frame:
     boards = []
     for player in game.players:
         board = _board(player, cell_size, game.shows_optimum)
-        advice = f"; {player.advice()}" if game.shows_optimum and player.real and not player.over else ""
+        names = np.array(player.evaluator.mdp.action_names)[player.evaluator.solution.optimal[player.state]]
+        is_advised = game.shows_optimum and player.real is not None and not player.over
+        advice = f"; optimal here: {' or '.join(names)}" if is_advised else ""
         board.caption(player.standing() + advice)
         legend = game.legend() if player is game.person else ""
         board.footer(player.verdict() if player.over else legend)
@@ -214,10 +203,10 @@ def _board(player: Player, cell_size: int, with_optimum: bool) -> Sheet:
         return canvas
     frame = real.frame()
     larger = max(1, _LEAST_PICTURE // max(frame.shape))
-    frame = frame.repeat(larger, axis=0).repeat(larger, axis=1)
-    height, width = frame.shape[:2]
+    height, width = frame.shape[0] * larger, frame.shape[1] * larger
     sheet = Sheet(width + 2 * _BORDER, height + 2 * _BORDER, _BORDER)
-    picture = drawing.import_pygame().image.frombuffer(np.ascontiguousarray(frame), (width, height), "RGB")
+    pixels = frame.repeat(larger, axis=0).repeat(larger, axis=1)
+    picture = drawing.import_pygame().image.frombuffer(pixels, (width, height), "RGB")
     sheet.world.blit(picture, (_BORDER, _BORDER))
     return sheet
 
@@ -261,8 +250,8 @@ def play(game: Game, cell_size: int) -> None:
                 elif event.type == pygame.KEYDOWN:
                     continues = game.press(pygame.key.name(event.key)) and continues
             frames += 1
-            if frames % _TICKS == 0:
-                game.tick()
+            if frames % _TICKS == 0 and game.person.over:
+                game.players[-1].act()
             if game.over and not is_printed:
                 for player in game.players:
                     print(printable(f"{player.standing()}; {player.verdict()}"), flush=True)

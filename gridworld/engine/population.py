@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -186,7 +187,7 @@ class Population:
     pushes: ClassVar[bool] = False  # whether it needs `Networks.push` of the networks that act
 
     def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
-        self.runs = runs
+        self._runs = [weakref.ref(run) for run in runs]
         for row, run in enumerate(runs):
             run.population, run.row = self, row
         first, mdp = runs[0], runs[0].envs.mdp
@@ -201,6 +202,11 @@ class Population:
                 self.set_state(run, state)
         self.num_timesteps = int(first.model.num_timesteps)
         self.environments = Environments([run.envs for run in runs])
+
+    @property
+    def runs(self) -> list[Run]:
+        """They keep the population, and it does not keep them, or its arrays would wait for the collector."""
+        return [run for each in self._runs if (run := each()) is not None]
 
     @classmethod
     def kind(cls, run: Run) -> Hashable:
@@ -330,7 +336,7 @@ def train(runs: Sequence[Run], states: Sequence[State | None]) -> None:
         if len(group) > 1 and agree(group):
             type(group[0].population)(group, [run.population.get_state(run) for run in group])
         for population in dict.fromkeys(run.population for run in group):
-            members = list(population.runs)
+            members = population.runs
             try:
                 population.learn(group[0].total_timesteps)
             except Exception as error:  # torch's, of settings that only it can judge

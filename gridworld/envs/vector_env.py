@@ -179,13 +179,15 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         infos: dict[str, Any] = {}
         if step.which.size:  # as `SyncVectorEnv` has them for environments without infos of their own
             mask, final_obs = step.terminated | step.truncated, np.full(self.num_envs, None, dtype=object)
-            final_obs[mask] = step.reached[mask].tolist()  # plain ints, as of one environment
+            final_obs[step.which] = step.reached[step.which].tolist()  # plain ints, as of one environment
             infos = {"final_obs": final_obs, "_final_obs": mask, "final_info": {}, "_final_info": mask.copy()}
         return step.states, step.rewards, step.terminated, step.truncated, infos
 
     def advance(self, actions: NDArray[Any]) -> Step:
         """`step` in arrays alone, for training."""
-        return self._advance(self._state * self._num_actions + self._check_actions(actions))
+        pairs = self._state * self._num_actions
+        pairs += self._check_actions(actions)
+        return self._advance(pairs)
 
     def _advance(self, pairs: StateArray) -> Step:
         starting, index = np.flatnonzero(self._over), pairs

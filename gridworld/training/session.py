@@ -101,8 +101,9 @@ class Session:
             from gridworld.training.wandb_log import begin
 
             self._wandb = begin(config, [self._origin["identity"], folder.absolute()], state is not None)
-        self._has_scalars = config.logging.tensorboard or config.logging.wandb
-        context = make_context(config, mdp, self._write_scalars if self._has_scalars else None)
+        has_scalars = config.logging.tensorboard or config.logging.wandb
+        self._write_scalars = partial(_write_scalars, self._events, self._wandb) if has_scalars else None
+        context = make_context(config, mdp, self._write_scalars)
         self._agent: Agent = config.agent.build(context)
         on_built(self._agent)
         self._visits = context.envs.visits
@@ -126,12 +127,6 @@ class Session:
             tell(f"no checkpoints, since {unknown} does not define get_state and set_state")
             return None
         return every
-
-    def _write_scalars(self, values: Mapping[str, float], step: int) -> None:
-        if self._events is not None:
-            self._events.scalars(values, step)
-        if self._wandb is not None:
-            self._wandb.log({**values, "step": step})
 
     def progress(self) -> dict[str, int | None]:
         """How many steps were made, and how many of them are saved."""
@@ -168,7 +163,7 @@ class Session:
         label = f"{config.agent.name} on {self._evaluator.mdp.name}"
         self._progress = Progress(config.total_timesteps, label, config.logging.progress)
         self._curve.sinks.append(partial(write_row, self._curve_log))
-        if self._has_scalars:
+        if self._write_scalars is not None:
             self._curve.sinks.append(CurveScalars(self._write_scalars, self._evaluator).write)
         self._curve.sinks += [partial(show_progress, self._progress), self._pictures.write]
 
@@ -273,6 +268,14 @@ class Session:
         with contextlib.suppress(*ignored), contextlib.ExitStack() as stack:
             for close in reversed(closing):  # all of them, whatever one raises
                 stack.callback(close)
+
+
+def _write_scalars(events: EventWriter | None, wandb: Any, values: Mapping[str, float], step: int) -> None:
+    # Not a method: the agent keeps it, and the session the agent, which would be a circle.
+    if events is not None:
+        events.scalars(values, step)
+    if wandb is not None:
+        wandb.log({**values, "step": step})
 
 
 def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, seconds: float) -> Summary:

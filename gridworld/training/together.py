@@ -11,7 +11,7 @@ import contextlib
 import dataclasses
 from collections.abc import Callable, Generator, Sequence
 from contextvars import copy_context
-from typing import Any, Generic, ParamSpec, TypeVar
+from typing import Generic, ParamSpec, TypeVar
 
 from gridworld.agents import Learning, learn_together
 from gridworld.process.together import share_clock
@@ -89,17 +89,14 @@ class _Run(Generic[T]):
             self.exit = stop
         else:
             save = learning.on_safe_point
+            context, step = self._context, learning.on_step  # a hook that knew `self` would be a circle
             self.learning = dataclasses.replace(
                 learning,
-                on_step=self._own(learning.on_step),
-                on_safe_point=None if save is None else self._own(save),
+                on_step=lambda steps: context.run(step, steps),
+                on_safe_point=None if save is None else lambda steps: context.run(save, steps),
             )
 
     def end(self, stop: BaseException) -> None:
         """Raise what it learnt with, or `stop`, in it; nothing happens if it has not begun or has ended."""
         with contextlib.suppress(BaseException):  # it may raise another one on its way out
             self._context.run(self._training.throw, self.error or stop)
-
-    def _own(self, hook: Callable[[int], Any]) -> Callable[[int], Any]:
-        """A hook that is called in this run's context."""
-        return lambda steps: self._context.run(hook, steps)

@@ -157,4 +157,4 @@ def test_record_says_where_it_cannot_write(
     with pytest.raises(SystemExit) as ended:
         run(record_command.main)
     told = f"{out}/episode.gif: Permission denied; choose another folder, or make {out} writable"
-    assert (ended.value.code, capsys.readouterr().err) == (2, f"error: {told} to it\n")
+    assert (ended.value.code, capsys.readouterr().err) == (2, f"error: {told}\n")

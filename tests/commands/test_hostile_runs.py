@@ -113,8 +113,8 @@ def test_nothing_of_a_hostile_run_gets_out(case: Hostile, good: Path, tmp_path: 
             assert case.words in ended.output, where
             assert ended.code == (0 if FINE in case.words or "policy of" in case.words else 2), where
         if command == "play":
-            # The window is all that is missing where a run on a map can be looked at.
-            assert (NO_DISPLAY in ended.output) == (looked_at == 0 and case.agent != "lake"), where
+            # The window is all that is missing where a run can be looked at.
+            assert (NO_DISPLAY in ended.output) == (looked_at == 0), where
         if command == "evaluate":
             looked_at = ended.code
 

@@ -189,7 +189,11 @@ def test_the_environments_own_observation():
 
 @pytest.mark.parametrize(
     ("kind", "why"),
-    [("own", "no observation of its own"), ("coordinates", "no coordinates"), ("image", "no coordinates")],
+    [
+        ("own", "no array observation of its own"),
+        ("coordinates", "no coordinates"),
+        ("image", "no coordinates"),
+    ],
 )
 def test_a_world_without_what_an_observation_shows(kind, why):
     with pytest.raises(InputError, match=f"^observation {kind}: .*row ha(s|ve) {why}") as refused:

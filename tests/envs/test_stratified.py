@@ -1,7 +1,5 @@
 """Draws that environments share out evenly: each environment's own chances stay what they are."""
 
-import math
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -29,19 +27,6 @@ def test_the_numbers_are_those_of_a_loop_over_groups(groups: IntArray, seed: int
     found, expected = np.random.default_rng(seed), np.random.default_rng(seed)
     assert np.array_equal(stratified_numbers(groups + first, found), by_hand(groups, expected))
     assert found.bit_generator.state == expected.bit_generator.state
-
-
-@given(GROUPS, st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0, 1))
-def test_a_part_of_the_interval_gets_its_share_of_a_group_rounded_down_or_up(
-    groups: IntArray, seed: int, first: float, last: float
-) -> None:
-    low, high = min(first, last), max(first, last)
-    numbers = stratified_numbers(groups, np.random.default_rng(seed))
-    assert ((numbers >= 0) & (numbers < 1)).all()
-    for group in np.unique(groups):
-        of_group = numbers[groups == group]
-        met, share = int(((of_group >= low) & (of_group < high)).sum()), len(of_group) * (high - low)
-        assert math.floor(share - 1e-9) <= met <= math.ceil(share + 1e-9)
 
 
 def test_the_starts_are_spread_over_the_states() -> None:

@@ -115,10 +115,7 @@ def test_curves_over_seeds_are_of_the_runs_that_are_left(
     flip(runs / "sarsa0" / "best_model.zip")
     folder = write_over_seeds(runs, runs)
     assert folder is not None
-    assert sorted(path.name for path in folder.iterdir()) == [
-        "q_learning on RiverSwim 6",
-        "sarsa on RiverSwim 6",
-    ]
+    assert [path.name for path in folder.iterdir()] == ["sarsa on RiverSwim 6"]  # of the other, one is left
     warnings = capsys.readouterr().err.splitlines()
     files = ("sarsa0/best_model.zip", "q_learning1/curve.csv")
     assert [line.partition(": ")[0] for line in warnings] == [str(runs / file) for file in files]

@@ -427,11 +427,15 @@ def test_swept_settings_are_a_line_or_a_heatmap_and_the_opening_is_short(
     assert cells.count(to_rgba("#c6c6c6")) == 5  # half of their seeds or more are never certified
     assert len(set(cells)) == 3  # 3 epochs, 10, never: the worst finite number has another colour
     assert drawn[f"classic ppo steps by {keys}"].caption.endswith("grey: no finite value.")
-    assert "the 7 best of 9" in drawn["classic regret"].caption
+    assert "the best 7 of 9" in drawn["classic regret"].caption
     (only,) = sweeps([result for result in task.results if "n_epochs=3)" in result.group.agent])
     assert next(sweep_charts(only, "classic")).title == "Seeds certified by learning_rate"
     assert not list(sweep_charts(replace(swept, keys=(*swept.keys, "agent.gamma")), "classic"))
     assert not sweeps(task.results[:2])  # two are a comparison
+    first, second = (swept.results[rate, "3"] for rate in ("0.002", "0.01"))
+    assert task.best == [first, second]  # in the same steps; others took more, or were not certified
+    others = [result for result in task.results if result is not first]
+    assert replace(task, results=tuple(others)).best == [second]
     page = render(report, {task.task: [], "": []})
     for words in (
         "18 runs, 1 agent, 9 configurations, 1 task",
@@ -664,7 +668,7 @@ def test_only_a_report_is_replaced(
     monkeypatch.setattr(command.webbrowser, "open", lambda uri: not uri.endswith("runs/report/report.html"))
     command.main(["a", "b", "--open", "--formats"])
     told = capsys.readouterr()
-    assert (told.out, told.err[:35]) == ("runs/report/report.html\n", "--open: no browser found here; o")
+    assert (told.out, told.err[:35]) == ("runs/report/report.html\n", "--open: no browser found here; open")
     assert logging.getLogger("matplotlib").handlers  # it says nothing on standard error
 
 

@@ -110,10 +110,16 @@ def test_a_sweep_is_come_back_to(swept: Path) -> None:
 
 def test_settings_are_told_by_the_words_that_asked_for_them(tmp_path: Path) -> None:
     """Many others follow from the slip, and would hide it."""
-    words = ("agent=ppo", "env.slip=0,0.1", "observation=one_hot,image", "total_timesteps=300", "seed=0")
+    words = (
+        "agent=ppo",
+        "env.slip=0,0.1",
+        "observation=one_hot,coordinates",
+        "total_timesteps=300",
+        "seed=0",
+    )
     done = sweep(*words, cwd=tmp_path)
     assert [row[2] for row in results(done.stdout)] == [
-        f"env.slip={slip} observation={kind}" for slip in ("0", "0.1") for kind in ("one_hot", "image")
+        f"env.slip={slip} observation={kind}" for slip in ("0", "0.1") for kind in ("one_hot", "coordinates")
     ]
     words = ("agent=q_learning", "n_envs=${seed}", "seed=3,4", "total_timesteps=300")  # which follows from it
     followed = script("train.py", "-m", *words, *NO_PICTURES, cwd=tmp_path)
@@ -235,14 +241,14 @@ def test_workers_do_not_outlive_a_killed_sweep(workers: tuple[str, ...], tmp_pat
 
 
 def test_a_fork_that_is_killed_takes_no_other_job_along(tmp_path: Path) -> None:
-    words = ["-m", *QUICK, "seed=range(4)", "total_timesteps=40000", FOLDER, *FORKS]
+    words = ["-m", *QUICK, "seed=range(3)", "total_timesteps=20000", FOLDER, *FORKS]
     with start("train.py", *words, cwd=tmp_path) as process:
         wait_for_a_job(tmp_path)
         os.kill(max(int(each) for each in members(process.pid)), signal.SIGKILL)
         _, errors = process.communicate(timeout=180)
     assert process.returncode == 0, errors
     assert "Traceback" not in errors
-    assert list(statuses(tmp_path / "sweep").values()) == ["done"] * 4
+    assert list(statuses(tmp_path / "sweep").values()) == ["done"] * 3
 
 
 def with_other_settings(run: Path) -> None:

@@ -2,9 +2,11 @@
 
 import csv
 import functools
+import gc
 import json
 import shutil
 import sys
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,14 +16,14 @@ import pytest
 from helpers.support import NO_FILES, SHORT, configure, train_in
 from PIL import Image
 
-from gridworld.agents import PolicySnapshot
+from gridworld.agents import Agent, PolicySnapshot
 from gridworld.envs.statistics_env import Returns
 from gridworld.errors import InputError
 from gridworld.restore.saved_run import SavedRun
 from gridworld.storage.safe_read import sealed
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.together import run_together
-from gridworld.training.train import training
+from gridworld.training.train import train, training
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.evaluation import Evaluator
 
@@ -239,3 +241,19 @@ def test_the_default_job_is_certified(agent: str, tmp_path: Path) -> None:
         assert summary["goal_probability"] == 1
         assert summary["length"] == 8
         assert int(summary["first_certified_step"]) <= int(summary["certified_since_step"])
+
+
+@pytest.mark.parametrize("words", [["dqn"], ["q_learning"], ["ppo", "agent.engine=stock"]], ids=str)
+def test_a_runs_memory_is_freed_when_it_ends(tmp_path: Path, words: list[str]) -> None:
+    """Not when the garbage collector comes by: a sweep's runs would pile up until then."""
+    config = configure(*SHORT[words[0]], *words[1:], *NO_FILES, "total_timesteps=640")
+    held: list[weakref.ref[Agent]] = []
+    gc.collect()
+    gc.disable()
+    try:
+        for folder in (tmp_path / "first", tmp_path / "second"):  # a first one imports what others have
+            folder.mkdir()
+            train(config, folder, [], on_built=lambda agent: held.append(weakref.ref(agent)))
+    finally:
+        gc.enable()
+    assert held[1]() is None

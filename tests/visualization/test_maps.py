@@ -56,6 +56,8 @@ def test_scales_run_from_end_to_end_in_order_of_lightness() -> None:
         assert steps.sum() > 120
     values = np.array([-2.0, 0.0, 2.0, np.inf])
     assert np.array_equal(linear(VIRIDIS, values).colours(values), VIRIDIS[[0, 64, 127, 127]])
+    above = np.array([1.0, 2.0])
+    assert np.array_equal(linear(ORANGES, above, low=0).colours(above), ORANGES[[64, 127]])
     logarithmic = counting(BLUES, np.array([0, 1, 10, 100]))
     assert np.array_equal(logarithmic.colours(np.array([1.0, 10, 100])), BLUES[[0, 64, 127]])
     assert not counting(BLUES, np.array([0, 5, 99])).logarithmic
@@ -99,6 +101,7 @@ def test_policy_map_marks_start_and_path_and_greys_what_was_never_visited() -> N
     greedy = np.argmax(best.optimal, axis=1)
     (path,) = greedy_paths(CLASSIC, greedy)
     assert path == [0, 1, 2, 3, 4, 5, 11, 17, 16]  # along the upper and the right border
+    assert greedy_paths(compile_mdp(load("classic"), slip=0.2), greedy) == [path]  # where it does not slip
     visits = np.zeros((30, 4), dtype=int)
     visits[path[:-1], 0] = 1
     known = explored(CLASSIC, visits)

@@ -190,9 +190,9 @@ def test_a_policy_table_frames_the_greedy_action(has_q: bool) -> None:
     q = value_iteration(world, 0.95).q.copy()
     q[2] = q[2, ::-1]
     visited = np.repeat(np.arange(6) < 4, 2).reshape(6, 2)
-    of_it: Any = subject(world, q, visited.astype(np.int64))
+    of_it = subject(world, q, visited.astype(np.int64))
     if not has_q:
-        of_it.snapshot = dataclasses.replace(of_it.snapshot, q=None)
+        of_it = dataclasses.replace(of_it, snapshot=dataclasses.replace(of_it.snapshot, q=None))
     frame = policy(of_it)(None)
     table = StateTable(world, table_states(world), world.action_names, legend_rows=2)
     for row in range(5):

@@ -117,6 +117,8 @@ class RunCallback(CallbackList):
             if self._on_safe_point is not None:
                 self._on_safe_point(self.model.num_timesteps)
         super()._on_training_end()
+        for callback in _flat([self]):
+            callback.locals = {}  # SB3 puts the callback itself there: a circle
 
 
 class FallingSetting(BaseCallback):

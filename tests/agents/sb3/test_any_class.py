@@ -114,11 +114,11 @@ def outcome(folder: Path, *words: str) -> str:
         ("a2c", f"{KWARGS}.optimizer_class=torch.optim.LBFGS", "torch.optim.LBFGS"),
         ("a2c", f"{KWARGS}.optimizer_class=torch.optim.Adafactor", ""),
         ("ppo", "agent.learning_rate=1e307", "training diverged at update"),
-        ("dqn", "agent.policy_kwargs.activation_fn=own_modules.Drawn", "DQN does not always give the same"),
+        ("dqn", "agent.policy_kwargs.activation_fn=own_modules.Drawn", "DQN does not always answer the same"),
         (
             "a2c",
             f"{KWARGS}.activation_fn=own_modules.Among",
-            "agent=a2c: stable_baselines3.A2C does not always give the same",
+            "agent=a2c: stable_baselines3.A2C does not always answer the same",
         ),
     ],
 )

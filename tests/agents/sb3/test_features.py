@@ -94,10 +94,6 @@ def test_learned_features_have_one_length_and_follow_from_distinct_squares() -> 
     assert all(weight.grad is not None and weight.grad.any() for weight in network.parameters())
 
 
-def test_it_learns_from_pixels(tmp_path: Path) -> None:
-    assert train_in(tmp_path, "agent=ppo", "observation=image", *NO_FILES)["certified"]
-
-
 @pytest.mark.parametrize(
     ("kind", "arguments", "words"),
     [

@@ -377,7 +377,7 @@ def drawn(length=4, seed=None):
 
 def test_a_function_that_draws_its_world_needs_a_seed():
     with pytest.raises(
-        InputError, match=r"^env.builder=drawn: returns a different world each time .* env.kwargs"
+        InputError, match=r"^env.builder=drawn: returns a different world each time.* env.kwargs"
     ):
         build(drawn)
     assert build(drawn, {"seed": 3}).text() == build(drawn, {"seed": 3}).text()

@@ -153,9 +153,9 @@ class Remembered(Chain):
 
 LIES = {
     "all rows": (AllRows, "all rows like P"),
-    "one row": (OneRow, r"P\[27\]\[1\], outcome 0, came"),
-    "sticky": (Sticky, "outcome [0-2], came"),
-    "starts": (FarStarts, "(the start in state|of 8 parts of the starts, part) [0-9]*, came"),
+    "one row": (OneRow, r"P\[27\]\[1\], outcome 0, occurred"),
+    "sticky": (Sticky, "outcome [0-2], occurred"),
+    "starts": (FarStarts, "(the start in state|of 8 parts of the starts, part) [0-9]*, occurred"),
     "seeded": (Seeded, "led to state"),
     "rare slips": (
         liar(Lake, lambda env, a: (a + 1) % 4 if env.np_random.random() < 0.01 else a),
@@ -175,7 +175,7 @@ LIES = {
         liar(Chain, paid=lambda env, was, a: env.room == 39),
         r"in state 38, action 1 led to state 39 with reward 2 and ended",
     ),
-    "heavy": (Heavy, "outcome [01], came"),
+    "heavy": (Heavy, "outcome [01], occurred"),
 }
 
 
