@@ -42,10 +42,9 @@ from gridworld.visualization.picture import Subject, drawer
 from gridworld.world.evaluation import Evaluator
 
 if TYPE_CHECKING:  # of most runs nothing is drawn
-    from matplotlib.figure import Figure
     from PIL import Image
 
-    from gridworld.report.chart import Chart
+    from gridworld.report.chart import NotebookFigure
 
 Curve = dict[str, NDArray[Any]]
 
@@ -109,7 +108,7 @@ class RunResult:
         """The trained agent, which has the model."""
         return self._make_agent()
 
-    def plot(self, metric: str = "value") -> Figure:
+    def plot(self, metric: str = "value") -> NotebookFigure:
         """Draw the exact learning curve of both policies next to the optimum, as a figure of matplotlib.
 
         Args:
@@ -118,12 +117,9 @@ class RunResult:
         Raises:
             InputError: there is no such metric.
         """
-        return self._chart(metric).figure
-
-    def _chart(self, metric: str) -> Chart:
         from gridworld.report.agent_charts import run_chart  # here, with matplotlib
 
-        return run_chart(metric, self.curve, self.evaluator, self.summary)
+        return run_chart(metric, self.curve, self.evaluator, self.summary).figure
 
     def policy_map(self, cell_size: int | None = None) -> Image.Image:
         """Draw its values and greedy actions, as in `policy.png`, as a picture of Pillow; cells in pixels."""
@@ -134,7 +130,7 @@ class RunResult:
 
     def _repr_html_(self) -> str:
         """Its verdict, learning curve and policy."""
-        pictures = [self._chart("value").saved_as("png")]
+        pictures = [self.plot()._repr_png_()]
         with contextlib.suppress(InputError):  # the world is too large for a map
             pictures.append(encode_png(np.asarray(self.policy_map())))
         sources = (f"data:image/png;base64,{base64.b64encode(each).decode()}" for each in pictures)

@@ -51,7 +51,7 @@ def compose(words: Sequence[str]) -> TrainConfig:
     try:
         with _leaving_hydra_as_it_was():
             _store_schemas()
-            return to_config(compose_whole(conf_folder(), "train", words)[0])
+            return compose_run(conf_folder(), words)[0]
     except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
         raise InputError(sentence(error)) from None
 
@@ -79,18 +79,25 @@ def named_world(name: str, **settings: Any) -> Mdp:
     return dataclasses.replace(mdp, max_episode_steps=env.step_limit(mdp))
 
 
-def compose_whole(conf: Path, name: str, overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
-    """Compose `name` with Hydra's own part, and the preset that the world needs; return its words, too."""
-    words = prepared(overrides)
-
-    def again(more: list[str]) -> DictConfig:
-        return hydra.compose(name, [*words, *more], return_hydra_config=True)
-
+def compose_whole(conf: Path, name: str, words: Sequence[str]) -> DictConfig:
+    """Compose `name` with Hydra's own part."""
     with hydra.initialize_config_dir(version_base=VERSION_BASE, config_dir=str(conf)):
-        found = again([])
-        if name != "train" or found.hydra.mode is RunMode.MULTIRUN:
-            return found, []
-        return with_preset(found, words, again)
+        return hydra.compose(name, prepared(words), return_hydra_config=True)
+
+
+def compose_run(conf: Path, words: Sequence[str]) -> tuple[TrainConfig, DictConfig, list[str]]:
+    """Compose a run's settings with the preset that the world needs; Hydra's own part; the preset's words."""
+    hydras: list[DictConfig] = []
+
+    def again(more: list[str]) -> TrainConfig:
+        whole = compose_whole(conf, "train", [*words, *more])
+        hydras.append(whole.hydra)
+        return to_config(whole)
+
+    config, chosen = again([]), list[str]()
+    if hydras[0].mode is not RunMode.MULTIRUN:
+        config, chosen = with_preset(config, prepared(words), again)
+    return config, hydras[bool(chosen)], chosen
 
 
 def completed(words: Sequence[str]) -> list[str]:
@@ -101,19 +108,19 @@ def completed(words: Sequence[str]) -> list[str]:
     values = [found[number] for number in places]
     if {word.partition("=")[0] for word in found} & _NO_SINGLE_RUN or not (own or may_need_preset(values)):
         return found
-    folders = [search_path([conf_folder()])] if own else []
+    folders = search_path([conf_folder()] if own else [])
     chosen: list[str] = []
     with contextlib.suppress(Exception):  # Hydra composes again, and says what is wrong
-        chosen = compose_whole([*own, conf_folder()][0], "train", [*folders, *values])[1]
+        chosen = compose_run([*own, conf_folder()][0], [*folders, *values])[2]
     end = places[-1] + 1 if places else len(found)  # options may follow
     return [*found[:end], *chosen, *found[end:]]
 
 
-def search_path(folders: Sequence[Path]) -> str:
-    """The override by which Hydra searches these folders too."""
+def search_path(folders: Sequence[Path]) -> list[str]:
+    """The word by which Hydra searches these folders too, if there are any."""
     places = [f"file://{folder.resolve()}" for folder in folders]
     quoted = [place if _PLAIN.fullmatch(place) else f"'{place}'" for place in places]
-    return f"hydra.searchpath=[{','.join(quoted)}]"
+    return [f"hydra.searchpath=[{','.join(quoted)}]"] if folders else []
 
 
 @contextlib.contextmanager

@@ -16,11 +16,9 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import yaml
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.config.settings import has_own_code
 from gridworld.config.train import AUTO, TrainConfig
@@ -39,8 +37,6 @@ _SIZE = ("total_timesteps", "n_envs")
 _CHOSEN_BY_HAND = re.compile(rf"\+*({'|'.join(_SIZE)}|tuned)=|preset=(?!auto$)")
 _OF_A_WORLD = re.compile(r"[+~]*(env|experiment|hydra)\b")
 
-Settings = TypeVar("Settings", TrainConfig, DictConfig)
-
 
 def may_need_preset(words: Sequence[str]) -> bool:
     """Whether a command line may choose another world than the default one, and leaves the preset open."""
@@ -48,23 +44,19 @@ def may_need_preset(words: Sequence[str]) -> bool:
 
 
 def with_preset(
-    config: Settings,
+    config: TrainConfig,
     words: Sequence[str],
-    compose: Callable[[list[str]], Settings],
+    compose: Callable[[list[str]], TrainConfig],
     world: Callable[[EnvConfig], Mdp] = compiled,
-) -> tuple[Settings, list[str]]:
+) -> tuple[TrainConfig, list[str]]:
     """Compose a command line again with the preset that `preset=auto` becomes.
 
-    `config` is what the command line's `words` compose to, as dataclasses or as Hydra has it; `compose` takes
-    further words. Returns the settings, and the words that were added.
+    `config` is what the command line's `words` compose to; `compose` takes further words. Returns the
+    settings, and the words that were added.
     """
     if config.preset != AUTO or any(map(_CHOSEN_BY_HAND.match, words)):
         return config, []
-    try:
-        env: Any = OmegaConf.to_object(config.env) if isinstance(config.env, DictConfig) else config.env
-    except OmegaConfBaseException:  # something is missing, which composing says
-        return config, []
-    recipe: str | None = config.recipe
+    env, recipe = config.env, config.recipe
     if recipe is not None and is_recipe_for(recipe, config.agent.name, env):
         return config, []
     preset = fitting_preset(config, lambda: world(env) if env.compiles_quickly else None)
@@ -76,15 +68,13 @@ def with_preset(
     return (again, chosen) if is_whole else (config, [])
 
 
-def fitting_preset(config: TrainConfig | DictConfig, world: Callable[[], Mdp | None]) -> str | None:
+def fitting_preset(config: TrainConfig, world: Callable[[], Mdp | None]) -> str | None:
     """The preset that the agent has for a world; None for none.
 
     That is so as well where `world` returns none, or the settings make none, which the check before training
     says.
     """
-    callbacks = config.callbacks
-    plain = OmegaConf.to_container(callbacks) if OmegaConf.is_config(callbacks) else callbacks
-    if getattr(config.agent, "engine", _ENGINE) != _ENGINE or has_own_code(plain):
+    if getattr(config.agent, "engine", _ENGINE) != _ENGINE or has_own_code(config.callbacks):
         return None
     try:
         mdp = world()

@@ -89,23 +89,13 @@ class DenseNetworks(_Rows):
     A layer is a batched product of (P, U, in) with (P, in, out), which makes for each network the product
     that it makes alone. The first layer's product with a unit vector is a column of its weights.
 
-    Args:
-        vectors: (P, W), copied to `weights`; `gradients` (P, W) are those of the last `backward`.
-        parameters: those of one network, in the order of a row.
-        nets: the layers of each output.
-        features: (S, n), what the first layers see of each state; None: its unit vector.
-        met: (U,), the only states that are ever met: in their columns alone, first layers of unit vectors
-            learn. None: all are.
+    `gradients` (P, W) are those of the last `backward`. `met` (U,) are the only states that are ever met: in
+    their columns alone, first layers of unit vectors learn. None: all are.
     """
 
-    def __init__(
-        self,
-        vectors: Tensor,
-        parameters: Sequence[Tensor],
-        nets: Sequence[Sequence[nn.Module]],
-        features: Tensor | None,
-        met: IntArray | None = None,
-    ) -> None:
+    def __init__(self, networks: Sequence[StateNetwork], met: IntArray | None = None) -> None:
+        vectors, parameters = torch.stack([each.vector() for each in networks]), networks[0].parameters
+        nets, features = networks[0].layers, networks[0].table()
         place = {id(parameter): number for number, parameter in enumerate(parameters)}
         self._shapes = [parameter.shape for parameter in parameters]
         self._met = None if met is None else torch.as_tensor(met, device=vectors.device)
@@ -250,18 +240,14 @@ class DenseNetworks(_Rows):
 class ModuleNetworks(_Rows):
     """Any network of one run, differentiated by torch; its parameters become views of its row of weights."""
 
-    def __init__(
-        self,
-        vector: Tensor,
-        parameters: Sequence[Tensor],
-        forward: Callable[[IntArray | None], tuple[Tensor, ...]],
-    ) -> None:
-        self.weights, self.gradients = aligned(vector[None]), aligned(torch.zeros_like(vector)[None])
+    def __init__(self, network: StateNetwork) -> None:
+        vectors, parameters = network.vector()[None], network.parameters
+        self.weights, self.gradients = aligned(vectors), aligned(torch.zeros_like(vectors))
         shapes = [each.shape for each in parameters]
         rows = zip(parameters, cut(self.weights[0], shapes), cut(self.gradients[0], shapes), strict=True)
         for parameter, data, grad in rows:
             parameter.data, parameter.grad = data, grad
-        self._forward, self._parameters = forward, parameters
+        self._forward, self._parameters = network.forward, parameters
         self._outputs: tuple[Tensor, ...] = ()
         self._pulled: list[tuple[Tensor, Sequence[Tensor]]] = []  # of each output, slopes and gradients
 
@@ -342,6 +328,10 @@ class StateNetwork:
         part.layers, part.parameters, part._outputs = self.layers[outputs], parameters, outputs
         return part
 
+    def vector(self) -> Tensor:
+        """(W,), its weights as they are in SB3's model."""
+        return torch.cat([parameter.detach().reshape(-1) for parameter in self.parameters])
+
     def rows(self, states: IntArray) -> NDArray[Any]:
         """The observations (U, *shape) of states (U,)."""
         return self._observation.rows(states)
@@ -399,12 +389,11 @@ class StateNetwork:
 
 def make_networks(networks: Sequence[StateNetwork], met: IntArray | None = None) -> Networks:
     """Those of P policies at once, with the weights that SB3's models have; see `DenseNetworks` for `met`."""
-    first, table = networks[0], networks[0].table()
-    vectors = [torch.cat([each.detach().reshape(-1) for each in own.parameters]) for own in networks]
-    if DenseNetworks.fit(first) and (first.is_look_up or table is not None):
-        return DenseNetworks(torch.stack(vectors), first.parameters, first.layers, table, met)
-    assert len(networks) == 1
-    return ModuleNetworks(vectors[0], first.parameters, first.forward)
+    first = networks[0]
+    if DenseNetworks.fit(first) and (first.is_look_up or first.table() is not None):
+        return DenseNetworks(networks, met)
+    (alone,) = networks
+    return ModuleNetworks(alone)
 
 
 def _kind(extractor: Any) -> Kind:

@@ -58,11 +58,6 @@ class OnPolicy(Population):
         """(P, 1, 1), of `settings`."""
         return np.array(self.settings(name)).reshape(-1, 1, 1)
 
-    def log_policy(self) -> tuple[Array, Array]:
-        """log π (P, S, A) and values (P, S) of all states."""
-        logits, values = self.outputs
-        return log_softmax(logits), values
-
     def snapshot(self, run: Run) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
         logits, values = self.outputs
         if self.networks.kept is not None:
@@ -77,7 +72,8 @@ class OnPolicy(Population):
         for run in self.runs:
             if "gae_lambda" in run.falling:
                 run.record("train/gae_lambda", gae_lambda[run.row])
-        old = self.log_policy()
+        logits, values = self.outputs
+        old = log_softmax(logits), values
         draws = [torch.rand(self.n_steps, self.num_envs, generator=run.torch_generator) for run in self.runs]
         rollout = self.environments.roll(np.exp(old[0]), torch.cat(draws, dim=1).numpy())
         for run in self.runs:

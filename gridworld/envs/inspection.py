@@ -26,9 +26,9 @@ from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load, positive_int
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import verified
-from gridworld.world.snapshots import alike, same
+from gridworld.world.reach import same
 from gridworld.world.sources.gymnasium_table import compile_table, has_table
-from gridworld.world.wrappers import NEUTRAL, Wrapped, known_class, step_limit, wrappers_of
+from gridworld.world.wrappers import NEUTRAL, STEPPED_BY, Wrapped, known_class, step_limit, wrappers_of
 
 # What a batch is, by the class whose methods it runs.
 _GYMNASIUM, _SB3 = "gymnasium.wrappers.vector", "stable_baselines3.common.vec_env"
@@ -56,15 +56,6 @@ _BATCHES = {
 }
 # Methods of a batch: who overrides one may do anything.
 _DECISIVE = ("step", "reset", "advance", "step_async", "step_wait", "_save_obs", "_obs_from_buf")
-# Attributes that say where an episode is, not what is done in it.
-_OF_AN_EPISODE = {
-    *("env", "_np_random", "_np_random_seed", "state", "_state", "s", "lastaction", "_elapsed_steps"),
-    *("_has_reset", "needs_reset", "rewards", "t_start", "total_steps", "current_reset_info"),
-    *("results_writer", "_cached_spec", "checked_step"),
-    *("episode_returns", "episode_lengths", "episode_times", "episode_start_time"),
-}
-_OF_A_WRAPPER = {"env", "_cached_spec"}  # of a custom one, whose other attributes may mean anything
-_LIBRARIES = ("gridworld", "gymnasium", "stable_baselines3")
 _BY_METHOD: dict[str, Callable[[Any, Any], Any]] = {  # what SB3's wrappers make of observations (S, ...)
     "extract": lambda wrapper, rows: rows[wrapper.key],
     "normalize": lambda wrapper, rows: wrapper.normalize_obs(rows),
@@ -135,7 +126,8 @@ def _single(env: gym.Env[Any, Any]) -> Task:
             "it cannot be solved exactly; make it a gymnasium.Wrapper"
         )
     if isinstance(mdp, GridMdp):
-        if known_class(real, {"gridworld.envs.env:GridWorldEnv": _NATIVE}, ("step", "reset")) is None:
+        methods = (*STEPPED_BY, "mdp", "np_random")
+        if known_class(real, {"gridworld.envs.env:GridWorldEnv": _NATIVE}, methods) is None:
             raise InputError(
                 f"env: {type(real).__name__} has its own step() or reset(), so its task may differ from its "
                 "map; leave them as in GridWorldEnv, or wrap it"
@@ -191,7 +183,7 @@ def _copies(batch: Any) -> Task:
             f"env: the {type(batch).__name__} contains the same environment twice; make a new one for each"
         )
     task = _single(first)
-    tasks = {index: _single(other) for index, other in enumerate(others, 1) if not _is_copy(first, other)}
+    tasks = {index: _single(other) for index, other in enumerate(others, 1)}
 
     def refuse_others(is_same: Callable[[Task], bool], mistake: str) -> None:
         for index, other in tasks.items():
@@ -221,17 +213,6 @@ def _copies(batch: Any) -> Task:
         lambda other: (Mdp.text(other.mdp), other.own_limit) == (text, limit), "is a different task from"
     )
     return replace(task, seen=functools.cache(seen), masks=masks)
-
-
-def _is_copy(one: gym.Env[Any, Any], other: gym.Env[Any, Any]) -> bool:
-    """Whether two environments are made alike, wrapper by wrapper, but for where they are."""
-    mine, its = ([*wrappers_of(each), each.unwrapped] for each in (one, other))
-
-    def is_like(one: Any, other: Any) -> bool:
-        is_known = one is mine[-1] or type(one).__module__.partition(".")[0] in _LIBRARIES
-        return alike(one, other, _OF_AN_EPISODE if is_known else _OF_A_WRAPPER)
-
-    return len(mine) == len(its) and all(map(is_like, mine, its))
 
 
 def _rows(table: ObservationTable) -> Any:

@@ -63,6 +63,15 @@ def styles(agents: Sequence[str]) -> Styles:
     return dict(zip(agents, itertools.cycle(cycler(linestyle=_DASHES) * cycler(color=COLOURS)), strict=False))
 
 
+class NotebookFigure(Figure):
+    """Is shown in a notebook, whether pyplot was imported there or not."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", dpi=1.5 * _POINTS)
+        return buffer.getvalue()
+
+
 @dataclass(frozen=True)
 class Chart:
     """A figure, laid out."""
@@ -70,7 +79,7 @@ class Chart:
     name: str  # of its files
     title: str  # what it is called where it cannot be seen
     description: str  # what is drawn, with which statistic of how many seeds; the caption in the page
-    figure: Figure
+    figure: NotebookFigure
 
     def __post_init__(self) -> None:
         if (engine := self.figure.get_layout_engine()) is not None:
@@ -102,22 +111,13 @@ class Chart:
         return buffer.getvalue()
 
 
-class NotebookFigure(Figure):
-    """Is shown in a notebook, whether pyplot was imported there or not."""
-
-    def _repr_png_(self) -> bytes:
-        buffer = io.BytesIO()
-        self.savefig(buffer, format="png", dpi=1.5 * _POINTS)
-        return buffer.getvalue()
-
-
 def new_figure(
     heading: str,
     height: float,
     grid: Literal["x", "y", None] = None,
     legend: Sequence[tuple[Artist, str]] = (),
     width: float = WIDTH,
-) -> tuple[Figure, Axes]:
+) -> tuple[NotebookFigure, Axes]:
     """A figure with a heading and a legend above its axes, which are about `height` points high."""
     names = [name for _, name in legend]
     columns, lines = 1, sum(name.count("\n") + 1 for name in names)
@@ -148,7 +148,7 @@ def new_figure(
 
 def figure_of_rows(
     heading: str, names: Sequence[str], least: float, grid: Literal["x", None] = "x"
-) -> tuple[Figure, Axes, float]:
+) -> tuple[NotebookFigure, Axes, float]:
     """A figure with a row for each name, from the top; also returns how high one is, in points."""
     each = least + LINE * max(name.count("\n") for name in names)
     figure, axes = new_figure(heading, each * len(names), grid)

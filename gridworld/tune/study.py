@@ -29,11 +29,12 @@ import optuna
 from omegaconf import OmegaConf
 from optuna.trial import FrozenTrial, TrialState
 
-from gridworld.config.compose import search_path, to_config
+from gridworld.config.compose import compose_run, search_path
 from gridworld.config.fields import Effect
 from gridworld.config.recipe_file import IN_A_STUDY, TRUST, overrides
 from gridworld.config.settings import ON_RESULT, flat, with_effects
 from gridworld.config.train import TrainConfig
+from gridworld.config.words import conf_folder
 from gridworld.errors import InputError
 from gridworld.process.console import command, printable, recorded_command_line, tell
 from gridworld.process.processes import Processes, can_fork
@@ -67,7 +68,7 @@ from gridworld.tune.confirmation import (
 )
 from gridworld.tune.objective import ERROR, with_values
 from gridworld.tune.search import SearchError, in_reach, open_study, search, study_url
-from gridworld.tune.study_spec import StudySpec, compose_with
+from gridworld.tune.study_spec import StudySpec
 
 SEARCH_JSON = "search.json"
 _EXPERIMENT, _WINNER = IN_A_STUDY
@@ -156,7 +157,7 @@ def _conclude(
 
 def _words_for(recipe: Path, spec: StudySpec) -> str:
     """What train.py needs with the recipe: the user's own folders, and trust in the user's own classes."""
-    words = [search_path(spec.conf)] if spec.conf else []
+    words = search_path(spec.conf)
     try:
         overrides(recipe)
     except InputError:
@@ -259,7 +260,7 @@ def write_recipe(
     """
 
     def composed(words: list[str], *more: Path) -> dict[str, Any]:
-        return _relevant(to_config(compose_with((*conf, *more), "train", words)))
+        return _relevant(compose_run(conf_folder(), [*words, *search_path((*conf, *more))])[0])
 
     bare = dict(flat(composed([f"{group}={choice}" for group, choice in choices.items()])))
     values = OmegaConf.create()

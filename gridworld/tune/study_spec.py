@@ -20,6 +20,7 @@ import dataclasses
 import json
 import math
 import random
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,9 +30,8 @@ from typing import Any, cast
 
 import optuna
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from optuna.distributions import (
     BaseDistribution,
@@ -41,7 +41,7 @@ from optuna.distributions import (
 )
 from yaml import YAMLError
 
-from gridworld.config.compose import compose_whole, register_schemas, search_path, slug, to_config
+from gridworld.config.compose import compose_run, compose_whole, register_schemas, search_path, slug
 from gridworld.config.fields import Effect
 from gridworld.config.recipe_file import CHOSEN, with_recipe
 from gridworld.config.settings import effect_of
@@ -112,16 +112,15 @@ def compose_study(words: Sequence[str], conf: tuple[Path, ...] = ()) -> StudySpe
     register_schemas()
     try:
         of_search, of_run = _divide(with_recipe(words))
-        whole = compose_with(conf, "train", of_run)
-        choices = {group: str(whole.hydra.runtime.choices[group]) for group in CHOSEN}
+        base, own, _ = compose_run(conf_folder(), [*of_run, *search_path(conf)])
+        choices = {group: str(own.runtime.choices[group]) for group in CHOSEN}
         if choices["preset"] == AUTO:  # nothing was chosen, and nothing is to be for the winner
             choices["preset"] = "none"
-        base = to_config(whole)
         if base.recipe is None:  # the pair has none
             choices["tuned"] = "none"
-        if not any(override.key_or_group == "tune" for override in of_search):
-            of_search = [*of_search, *_parse([f"tune={choices['agent']}"])]
-        search = compose_with(conf, "tune", of_search)
+        if not any(re.match(r"[+~]*tune(?!\.)", word) for word in of_search):
+            of_search.append(f"tune={choices['agent']}")
+        search = compose_whole(conf_folder(), "tune", [*of_search, *search_path(conf)])
         space_name = str(search.hydra.runtime.choices["tune"])
         settings = cast(TuneConfig, OmegaConf.to_object(search.tune))
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
@@ -135,20 +134,10 @@ def compose_study(words: Sequence[str], conf: tuple[Path, ...] = ()) -> StudySpe
     return spec
 
 
-def compose_with(conf: tuple[Path, ...], name: str, overrides: Sequence[Override | str]) -> DictConfig:
-    """Compose `name`, also from these folders, with Hydra's own part. Raises Hydra's exceptions."""
-    lines = [str(each.input_line) if isinstance(each, Override) else each for each in overrides]
-    if conf:
-        lines.append(search_path(conf))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)  # a folder that is not there
-        return compose_whole(conf_folder(), name, lines)[0]
-
-
-def _divide(words: Sequence[str]) -> tuple[list[Override], list[Override]]:
+def _divide(words: Sequence[str]) -> tuple[list[str], list[str]]:
     """Overrides of the search and of the run."""
-    of_search, of_run = list[Override](), list[Override]()
-    for override in _parse(words):
+    of_search, of_run = list[str](), list[str]()
+    for override in OverridesParser.create().parse_overrides(list(words)):
         if override.is_sweep_override():
             raise InputError(
                 f"{override.input_line}: a study has one baseline configuration; give one value, and put "
@@ -158,12 +147,9 @@ def _divide(words: Sequence[str]) -> tuple[list[Override], list[Override]]:
             raise InputError(
                 f"{override.input_line}: {program('tune')} makes its own folder; use tune.folder"
             )
-        (of_search if override.key_or_group.split(".")[0] == "tune" else of_run).append(override)
+        is_of_search = override.key_or_group.split(".")[0] == "tune"
+        (of_search if is_of_search else of_run).append(str(override.input_line))
     return of_search, of_run
-
-
-def _parse(words: Sequence[str]) -> list[Override]:
-    return OverridesParser.create().parse_overrides(list(words))
 
 
 def _completed(settings: TuneConfig, agent: str, base: TrainConfig) -> TuneConfig:

@@ -9,8 +9,8 @@ Every wrapper is looked at, and recognised by whose `step` and `reset` it runs:
     action       `action(a)`, compiled into the transitions
     memory       shows more than the state's number; the task is the same, but a policy behind it has no table
 
-Anything else is refused. The three methods must be functions of their argument alone: they are asked on a
-copy (`snapshots.asked`), and the copy is stepped beside the tables.
+Anything else is refused. The three methods must be functions of their argument alone (`reach.asked`); a copy
+is stepped beside the tables for a while.
 """
 
 from __future__ import annotations
@@ -31,13 +31,12 @@ from numpy.typing import NDArray
 from gridworld.errors import InputError, in_short
 from gridworld.world.mdp import Mdp, checked_reward, frozen
 from gridworld.world.outcomes import absorbing_states, thresholds_of
-from gridworld.world.snapshots import SO_UNKNOWN, asked, remembered, same
+from gridworld.world.reach import SO_UNKNOWN, Reach, asked, same
 from gridworld.world.solver import backup, swept_values
 
 NEUTRAL, LIMIT, MEMORY = "neutral", "time limit", "memory"
-_STEPS, _MOST_STEPS = 2000, 40_000  # of the copy beside the tables, in episodes
+_STEPS, _MASKED_STEPS = 500, 2000  # of the copy beside the tables
 _GAMMA = 0.99
-_ROWS = 20_000  # pairs of state and action that are tried one by one, if states can be set
 _SEED = 20_261_123
 
 _ROLES = {
@@ -56,8 +55,7 @@ for _module, _names, _role in (
     ("stateful_observation", "NormalizeObservation TimeAwareObservation", MEMORY),
 ):
     _ROLES |= {f"gymnasium.wrappers.{_module}:{_name}": _role for _name in _names.split()}
-# What a transform may look at, so that it is copied too.
-_COPIED = {"Monitor", "OrderEnforcing", "RecordEpisodeStatistics", "TimeLimit"}
+STEPPED_BY = ("step", "reset", "env", "unwrapped", "__getattribute__")  # who overrides one may do anything
 # Environments whose state can be set, by the class whose steps they run.
 _STATE_ATTRIBUTES = {
     "gridworld.envs.env:GridWorldEnv": "state",
@@ -79,7 +77,7 @@ def known_class(thing: Any, table: dict[str, str], methods: Sequence[str]) -> st
 
     None if there is none, or a method is its own.
     """
-    kind, held = type(thing), getattr(thing, "__dict__", ())
+    kind, held = type(thing), getattr(thing, "__dict__", {}).keys() - {"env"}
     for base in kind.__mro__:
         if entry := table.get(f"{base.__module__}:{base.__qualname__}"):
             inherited = all(getattr(kind, name, None) is getattr(base, name, None) for name in methods)
@@ -89,10 +87,10 @@ def known_class(thing: Any, table: dict[str, str], methods: Sequence[str]) -> st
 
 def role_of(where: str, wrapper: gym.Wrapper[Any, Any, Any, Any]) -> str:
     """What a wrapper does, as in `_ROLES`; refuses one that may do anything."""
-    name, role = type(wrapper).__name__, known_class(wrapper, _ROLES, ("step", "reset"))
+    name, role = type(wrapper).__name__, known_class(wrapper, _ROLES, STEPPED_BY)
     if role is None:
         raise InputError(
-            f"{where}: its wrapper {name} has its own step() or reset(), which may change the task, so it "
+            f"{where}: its wrapper {name} has its own step() or reset(), or changes access to them, so it "
             "cannot be solved exactly; leave it out, or make it a gymnasium ObservationWrapper, "
             "RewardWrapper or ActionWrapper that defines only observation(), reward() or action()"
         )
@@ -131,14 +129,14 @@ class Wrapped:
 
     def __init__(self, where: str, env: gym.Env[Any, Any], mdp: Mdp) -> None:
         self._where, self._env, self._bare = where, env, mdp
-        self._attribute = known_class(env.unwrapped, _STATE_ATTRIBUTES, ("step", "reset"))
+        self._attribute = known_class(env.unwrapped, _STATE_ATTRIBUTES, STEPPED_BY)
         roles = [(wrapper, role_of(where, wrapper)) for wrapper in list(wrappers_of(env))[::-1]]
         self.memory = [type(wrapper).__name__ for wrapper, role in roles if role == MEMORY]
         self.transforms = [wrapper for wrapper, role in roles if role in ("observation", "reward", "action")]
         changing = [type(wrapper).__name__ for wrapper, role in roles if role in ("reward", "action")]
         self.mdp = mdp
         if changing:
-            for wrapper in self._copied_transforms:
+            for wrapper in self.transforms:
                 if isinstance(wrapper, gym.RewardWrapper):
                     self.mdp = self._paid(self.mdp, wrapper)
                 elif isinstance(wrapper, gym.ActionWrapper):
@@ -163,9 +161,9 @@ class Wrapped:
                 )
 
         if self.transforms:
-            for wrapper in self._copied_transforms:
+            for wrapper in self.transforms:
                 if isinstance(wrapper, gym.ObservationWrapper):
-                    rows = self._asked(wrapper, "observation", rows)
+                    rows = asked(self._where, wrapper, "observation", rows)
             self._check_steps(compare)
         return rows
 
@@ -175,20 +173,23 @@ class Wrapped:
         if not self._env.has_wrapper_attr("action_masks"):
             return None
         env = self._copied
-        masks = env.get_wrapper_attr("action_masks")
-        for each in self._chain:
-            if hasattr(type(each), "action_masks"):
-                remembered(self._where, "action_masks()", each, self._chain)  # refuses another environment
+        masks, chain = env.get_wrapper_attr("action_masks"), [*wrappers_of(env), env.unwrapped]
         if self._attribute is None:
             raise InputError(
                 f"{self._where}: action_masks() is not available for each state, since the state of "
                 f"{type(env.unwrapped).__name__} cannot be set; use a model without masks"
             )
+        within = [
+            Reach(self._where, each, "action_masks", chain) for each in chain if hasattr(each, "action_masks")
+        ]
+        before = [each.content(is_outside=True) for each in within]
         found = np.ones((self._bare.num_states, self.mdp.num_actions), dtype=np.bool_)
         for state in np.flatnonzero(self._bare.acting).tolist():
-            self._set(state)
+            setattr(env.unwrapped, self._attribute, int(self._bare.number[state]))
             with self._refusing("action_masks() failed"):
                 found[state] = masks()
+                if [each.content(is_outside=True) for each in within] != before:
+                    raise InputError(f"{self._where}: action_masks() keeps memory{SO_UNKNOWN}")
 
         def compare(number: int, observation: Any) -> None:
             if self._bare.acting[number] and not np.array_equal(found[number], masks()):
@@ -197,19 +198,18 @@ class Wrapped:
                     f"{SO_UNKNOWN}"
                 )
 
-        self._check_steps(compare)
+        self._check_steps(compare, _MASKED_STEPS)
         return found
 
     @cached_property
     def _copied(self) -> gym.Env[Any, Any]:
-        """A copy of the environment to ask and to step, without what draws and what only shows more."""
+        """A copy of the environment to step: of its wrappers only those that transform, and custom ones."""
         env: Any = _Probe(copied(self._env.unwrapped))
         self._probe, seen = env, {id(self._env.unwrapped): env.unwrapped}
         for wrapper in list(wrappers_of(self._env))[::-1]:
             kind = type(wrapper)
-            only_adds = kind.step is gym.Wrapper.step and kind.reset is gym.Wrapper.reset
-            if wrapper in self.transforms or kind.__name__ in _COPIED or only_adds:
-                seen[id(getattr(wrapper, "results_writer", None))] = None  # an open file, of a Monitor
+            is_custom = kind.step is gym.Wrapper.step and kind.reset is gym.Wrapper.reset
+            if wrapper in self.transforms or is_custom:
                 try:
                     other = copy.deepcopy(wrapper, seen)
                 except Exception as error:
@@ -233,27 +233,11 @@ class Wrapped:
         except Exception as error:
             raise InputError(f"{self._where}: {what} ({in_short(error)})") from error
 
-    @property
-    def _chain(self) -> list[Any]:
-        """The copied environment and its wrappers, from the inside."""
-        return [self._copied.unwrapped, *[*wrappers_of(self._copied)][::-1]]
-
-    @property
-    def _copied_transforms(self) -> list[Any]:
-        kinds = gym.ObservationWrapper | gym.RewardWrapper | gym.ActionWrapper
-        return [each for each in self._chain if isinstance(each, kinds) and each is not self._probe]
-
-    def _asked(self, wrapper: Any, method: str, arguments: list[Any]) -> list[Any]:
-        return asked(self._where, wrapper, method, arguments, self._chain)
-
-    def _set(self, state: int) -> None:
-        setattr(self._copied.unwrapped, str(self._attribute), int(self._bare.number[state]))
-
     def _paid(self, mdp: Mdp, wrapper: Any) -> Mdp:
         """The world with a wrapper's rewards; an end pays nothing, nor does a state without a way to it."""
         counts = (mdp.probability > 0) & (~mdp.absorbing | mdp.reachable & ~mdp.terminal)[:, None, None]
         given, what = np.unique(mdp.reward[counts]), f"{self._where}: a reward of {type(wrapper).__name__}"
-        paid = [_plain(reward) for reward in self._asked(wrapper, "reward", given.tolist())]
+        paid = [_plain(reward) for reward in asked(self._where, wrapper, "reward", given.tolist())]
         made = np.array([checked_reward(what, each) for each in paid])
         reward = np.zeros(mdp.reward.shape)
         reward[counts] = made[np.searchsorted(given, mdp.reward[counts])]
@@ -264,7 +248,7 @@ class Wrapped:
         space, name = wrapper.action_space, type(wrapper).__name__
         if not is_discrete(space, getattr(space, "n", -1)):
             raise InputError(f"{self._where}: the actions of {name} are {space}; must be Discrete(n) from 0")
-        chosen = [_plain(each) for each in self._asked(wrapper, "action", list(range(int(space.n))))]
+        chosen = [_plain(each) for each in asked(self._where, wrapper, "action", list(range(int(space.n))))]
         for action, inner in enumerate(chosen):
             if not isinstance(inner, int) or inner not in range(mdp.num_actions):
                 raise InputError(
@@ -275,49 +259,26 @@ class Wrapped:
         chosen_tables = {key: getattr(mdp, key)[:, np.array(chosen, dtype=int)] for key in tables}
         return _changed(mdp, action_names=tuple(mdp.action_names[each] for each in chosen), **chosen_tables)
 
-    def _check_steps(self, compare: Callable[[int, Any], None]) -> None:
-        """Step the copy beside the tables: from every state that can be set, then in whole episodes.
+    def _check_steps(self, compare: Callable[[int, Any], None], steps: int = _STEPS) -> None:
+        """Step the copy beside the tables, along good and random ways.
 
         `compare` is called with every number and what is seen of it.
         """
         env, probe, rng = self._copied, self._probe, np.random.default_rng(_SEED)
-        actions, acting = self.mdp.num_actions, self._bare.acting
-        tried = np.zeros(self.mdp.num_states, dtype=np.int64)
-
-        def reset(**given: Any) -> None:
-            with self._refusing("cannot be reset"):
-                observation = env.reset(**given)[0]
-            compare(probe.number, observation)
-
-        def step(state: int, action: int) -> None:
+        good = backup(self.mdp, swept_values(self.mdp, _GAMMA), _GAMMA).argmax(axis=1).tolist()
+        over = True
+        for number in range(steps):
+            if over:
+                with self._refusing("cannot be reset"):
+                    observation = env.reset(seed=None if number else _SEED)[0]
+                compare(probe.number, observation)
+            state, is_random = probe.number, rng.random() < (number // 100) % 3 / 2
+            action = int(rng.integers(self.mdp.num_actions)) if is_random else good[state]
             with self._refusing("cannot be stepped"):
                 observation, reward, terminated, truncated, _ = env.step(action)
-            tried[state] += 1
             self._check_step(state, action, float(_plain(reward)), bool(terminated))
             compare(probe.number, observation)
-            if terminated or truncated:
-                reset()
-
-        reset(seed=_SEED)
-        if self._attribute is not None:
-            pairs = np.flatnonzero(np.repeat(acting, actions))
-            pairs = pairs if len(pairs) <= _ROWS else rng.choice(pairs, _ROWS, replace=False)
-            for pair in pairs.tolist():
-                self._set(pair // actions)
-                step(*divmod(pair, actions))
-        reset()
-        good = backup(self.mdp, swept_values(self.mdp, _GAMMA), _GAMMA).argmax(axis=1).tolist()
-        for number in range(_MOST_STEPS):
-            if number >= _STEPS and tried[self.mdp.acting].all():
-                break
-            state, is_random = probe.number, rng.random() < (number // 500) % 3 / 2
-            step(state, int(rng.integers(actions)) if is_random else good[state])
-        unmet = np.flatnonzero(self.mdp.acting & (tried == 0))
-        if unmet.size and self._attribute is None:
-            raise InputError(
-                f"{self._where}: state {unmet[0]} was not reached in {_MOST_STEPS:,} steps, so the effect "
-                "of the wrappers on it is unknown; leave them out"
-            )
+            over = terminated or truncated
 
     def _check_step(self, state: int, action: int, reward: float, terminated: bool) -> None:
         mdp, pair, number = self.mdp, (state, action), self._probe.number

@@ -1,7 +1,8 @@
 """A score is of what was given: wrappers, every copy of a batch, what `predict` does. Truth is by playing."""
 
 import functools
-import random
+import time
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -10,11 +11,13 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces, wrappers
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from sb3_contrib import MaskablePPO
 from sb3_contrib.common.wrappers import ActionMasker
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.utils import constant_fn
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
@@ -94,22 +97,6 @@ class Fewer(gym.ActionWrapper):
         return 2 - int(action)
 
 
-class Alternating(gym.ActionWrapper):
-    turn = 0
-
-    def action(self, action: Any) -> Any:
-        self.turn += 1
-        return (action + self.turn // 5000) % 4
-
-
-class Tired(gym.RewardWrapper):
-    steps = 0
-
-    def reward(self, reward: Any) -> float:
-        self.steps += 1
-        return float(reward) - 0.001 * (self.steps // 3000)
-
-
 class Costly(gym.ObservationWrapper):
     """An observation wrapper by name, and more by its step."""
 
@@ -144,10 +131,6 @@ def paid_by(reward: Callable[[Any], Any]) -> Make:
     return lambda env: wrappers.TransformReward(env, reward)
 
 
-def by_closure(env: Any) -> Any:
-    return paid_by(lambda r: float(r) - 0.1 * (getattr(env.unwrapped, "s", 0) == 1))(env)
-
-
 NEUTRAL: dict[str, Make] = {
     "Monitor": Monitor,
     "a Monitor of one's own that steps as it does": own(Monitor, close=lambda self: None),
@@ -175,19 +158,12 @@ COMPILED: dict[str, Make] = {
 }
 # fmt: off
 UNKNOWN: dict[str, Make] = {
-    "random actions": acting(
-        lambda self, a: self.action_space.sample() if self.np_random.random() < 0.3 else a),
-    "random actions, one in ten thousand": acting(lambda self, a: 0 if DRAWS.random() < 1e-4 else a),
     "random actions in a step of its own": Restless,
     "StickyAction": lambda env: wrappers.StickyAction(env, 0.2),
     "RepeatAction": lambda env: wrappers.RepeatAction(env, 2),
     "MaxAndSkipObservation": lambda env: wrappers.MaxAndSkipObservation(env, 2),
-    "an action that depends on time": Alternating,
     "an action that depends on the state": acting(lambda self, a: 0 if state_of(self) == 1 else a),
-    "a reward that depends on time": Tired,
     "a reward that depends on the state": paying(lambda self, r: float(r) + (state_of(self) in (4, 8))),
-    "a reward that sees through a closure": by_closure,
-    "a random reward": paid_by(lambda r: float(r) - (random.random() < 1e-4)),
     "NormalizeReward": wrappers.NormalizeReward,
     "an observation wrapper with a step": Costly,
     "a reset of its own": Elsewhere,
@@ -288,27 +264,24 @@ class Mixing(VecEnvWrapper):
         return self.venv.reset()
 
 
-class ByDefault(gym.RewardWrapper):
-    def reward(self, reward: Any, count: Any = [0]) -> float:  # noqa: B006
-        count[0] += 1
-        return float(reward) - (count[0] > 10**6)
+class Elusive(gym.Wrapper):
+    """Shows another step to whoever asks for it."""
+
+    def __getattribute__(self, name: str) -> Any:
+        return super().__getattribute__("env").step if name == "step" else super().__getattribute__(name)
 
 
-class ByClass(gym.RewardWrapper):
-    calls = 0
+class Indirect(gym.Wrapper):
+    """Says itself which environment is below it."""
 
-    def reward(self, reward: Any) -> float:
-        type(self).calls += 1
-        return float(reward) - (self.calls > 10**6)
+    env = property(lambda self: self.held, lambda self, env: setattr(self, "held", env))
 
 
-def rarely() -> bool:
-    return bool(DRAWS.random() < 1e-5)
-
-
-def by_generator(env: Any) -> Any:
-    ticks = (number > 10**6 for number in range(10**9))
-    return paid_by(lambda r: float(r) - next(ticks))(env)
+def constant(value: float) -> Any:
+    """A closure of an installed library."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return constant_fn(value)
 
 
 class Delegating(gym.Env):
@@ -368,14 +341,17 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {  # what makes an environme
     "a batch that pays": (lambda: wrappers.vector.TransformReward(native(), lambda r: -r), _BATCH),
     "a batch that scales": (lambda: wrappers.vector.NormalizeReward(SyncVectorEnv([lake])), _BATCH),
     "a batch that shows otherwise": (lambda: Saving([lake]), _ENV),
-    "an elapsed time": (lambda: paying(
-        lambda self, r: float(r) - 0.1 * (self.get_wrapper_attr("_elapsed_steps") > 3))(lake()), _ENV),
-    "what a Monitor has noted":
-        (lambda: acting(lambda self, a: a if len(self.env.rewards) < 3 else 0)(Monitor(lake())), _ENV),
-    "a count in a default": (lambda: ByDefault(lake()), _ENV),
-    "a count in a class": (lambda: ByClass(lake()), _ENV),
-    "chance in a helper": (lambda: acting(lambda self, a: 0 if rarely() else a)(lake()), _ENV),
-    "a generator": (lambda: by_generator(lake()), _ENV),
+    "what a Monitor has counted":
+        (lambda: paying(lambda self, r: r + self.env.total_steps)(Monitor(lake())), "below it .total_steps"),
+    "the state, where it can be read":
+        (lambda: paying(lambda self, r: getattr(self.unwrapped, "state", r))(lake()), "below it .unwrapped"),
+    "a clock": (lambda: paid_by(lambda r: r + (time.monotonic() < 0))(lake()), "refers to time.monotonic"),
+    "a step by another way": (lambda: Elusive(lake()), _STEP),
+    "an environment by another way": (lambda: Indirect(lake()), _STEP),
+    "a grid that is asked by another way":
+        (own(gridworld.GridWorldEnv, mdp=property(lambda self: self._mdp)), _STEP),
+    "copies with another function of a library":
+        (lambda: DummyVecEnv([lambda k=k: paid_by(constant(k))(lake()) for k in (1, -1)]), "different task"),
     "what is no wrapper": (Delegating, _ENV),
     "an action that is a float":
         (lambda: wrappers.TransformAction(lake(), float, spaces.Discrete(4)), _ENV),
@@ -394,6 +370,14 @@ def test_what_may_be_another_task_is_refused(what: str) -> None:
     make, told = REFUSED[what]
     with pytest.raises(InputError, match=told):
         gridworld.evaluate(BEST, make())
+
+
+def test_a_class_whose_step_is_replaced_is_compared_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    gridworld.evaluate(BEST, lake())
+    step = FrozenLakeEnv.step
+    monkeypatch.setattr(FrozenLakeEnv, "step", lambda self, action: step(self, (action + 1) % 4))
+    with pytest.raises(InputError, match="does not follow its own table"):
+        gridworld.evaluate(BEST, lake())
 
 
 def test_copies_of_a_batch_must_be_one_task() -> None:

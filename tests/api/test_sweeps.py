@@ -124,11 +124,10 @@ def test_recordings(tmp_path: Path) -> None:
 
 
 def test_a_study(tmp_path: Path) -> None:
-    few = {"tune.trials": 2, "tune.seeds": 1, "tune.final_seeds": 1, "tune.confirm_seeds": 2}
-    study = gridworld.tune("agent=q_learning", few, *SMALL, folder=tmp_path / "study", progress=False)
+    few = {"trials": 2, "seeds": 1, "final_seeds": 1, "confirm_seeds": 2, "workers": 1}
+    words = ("agent=q_learning", {"tune": few}, *SMALL)
+    study = gridworld.tune(*words, folder=tmp_path / "study", progress=False)
     assert len(study.trials) == 2
     assert study.sentence in repr(study)
     found = gridworld.compose(recipe=tmp_path / "study").agent
     assert {f"agent.{key}": getattr(found, key) for key in ("learning_rate",)}.items() <= study.values.items()
-    with pytest.raises(InputError, match="seed=0,1: a study has one"):
-        gridworld.tune("agent=q_learning", seed=range(2), folder=tmp_path / "other")

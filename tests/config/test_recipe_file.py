@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 from helpers.support import CONF, configure, script
 
-from gridworld.config.compose import register_schemas, to_config
+from gridworld.config.compose import compose_run, register_schemas, search_path
 from gridworld.config.recipe_file import harmless_words, overrides, with_recipe
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import BuiltConfig
 from gridworld.errors import InputError
 from gridworld.storage.safe_read import read_object
 from gridworld.tune.study import write_recipe
-from gridworld.tune.study_spec import compose_study, compose_with
+from gridworld.tune.study_spec import compose_study
 
 WINNERS = {
     "dqn": [
@@ -50,8 +50,8 @@ def test_a_winner_is_the_same_by_hydra_and_as_data(agent: str, tmp_path: Path) -
     choices |= {"tuned": "none" if agent == "ppo" else f"cliff_{agent}"}
     words = [*(f"{group}={choice}" for group, choice in choices.items()), *WINNERS[agent]]
     path = write_recipe(tmp_path, (), choices, configure(*words), "a winner")
-    by_hydra = compose_with((tmp_path,), "train", ["experiment=winner"])
-    assert of_words(f"recipe={path}") == to_config(by_hydra) == configure(*words)
+    by_hydra, *_ = compose_run(CONF, ["experiment=winner", *search_path([tmp_path])])
+    assert of_words(f"recipe={path}") == by_hydra == configure(*words)
     assert of_words(f"recipe={tmp_path}") == configure(*words)
 
 
@@ -180,7 +180,7 @@ def test_a_study_whose_recipe_is_elsewhere_is_refused(tmp_path: Path) -> None:
 
 REFUSED = {
     "hydra: {run: {dir: evil}}": ("hydra.run.dir=out", "winner.yaml: has an unknown key 'hydra'"),
-    "agent: {n_steps: 3}": ("-m agent=q_learning,sarsa", "'agent.n_steps': Key 'n_steps' not in"),
+    "agent: {n_steps: 3}": ("-m agent=q_learning,sarsa", "agent.n_steps: no such setting in QLearningConfig"),
     "defaults: [{override /agent: mine}]": ("seed=1", "agent=mine: no such choice"),
     "evaluation: {stop_after: often}": ("seed=1", "'often' of type 'str' could not be converted to Integer"),
     "env: {slip: {a: 1}}": ("seed=1", "slip"),

@@ -135,7 +135,8 @@ def test_updates_from_rollouts(
         arguments = {"batch_size": n_steps * NUM_ENVS, "n_critic_updates": 2, **arguments}
     run, theirs = twins(algorithm, kind, n_steps=n_steps, **arguments)
     states, actions, advantages, returns = samples(run, n_steps * NUM_ENVS)
-    log_prob, values = run.population.log_policy()
+    logits, values = run.population.outputs
+    log_prob = on_policy.log_softmax(logits)
     buffer, shape = theirs.rollout_buffer, (NUM_ENVS, n_steps)  # samples are environment by environment
     buffer.observations = run.network.rows(states).reshape(*shape, *buffer.obs_shape).swapaxes(0, 1)
     buffer.actions = actions.reshape(shape).T[..., None]
@@ -287,7 +288,7 @@ def test_rollouts_and_advantages_are_sb3s(algorithm: Any) -> None:
 
     ours.environments.roll = rolled
     ours.update = lambda *arguments: found.update(samples=arguments)
-    _, values = ours.log_policy()
+    _, values = ours.outputs
     ours.iterate()
     rollout, (_, _, advantages, returns) = found["rollout"], found["samples"]
     buffer, states = theirs.rollout_buffer, rollout.pairs[:, 0] // 4

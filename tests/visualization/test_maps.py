@@ -101,6 +101,7 @@ def test_policy_map_marks_start_and_path_and_greys_what_was_never_visited() -> N
     greedy = np.argmax(best.optimal, axis=1)
     (path,) = greedy_paths(CLASSIC, greedy)
     assert path == [0, 1, 2, 3, 4, 5, 11, 17, 16]  # along the upper and the right border
+    assert greedy_paths(compile_mdp(load("classic"), slip=0.2), greedy) == [path]  # where it does not slip
     visits = np.zeros((30, 4), dtype=int)
     visits[path[:-1], 0] = 1
     known = explored(CLASSIC, visits)

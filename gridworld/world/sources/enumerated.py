@@ -34,7 +34,9 @@ from gridworld.process.console import telling_if_slow
 from gridworld.process.user_input import check_memory
 from gridworld.world.mdp import BoolArray, Mdp
 from gridworld.world.outcomes import MOST_ACTIONS, MOST_STATES, Outcomes, mdp_from_outcomes
-from gridworld.world.snapshots import Snapshots, digest, random_states
+from gridworld.world.reach import Reach
+from gridworld.world.reading import UnreadableError, digest
+from gridworld.world.snapshots import Snapshots, random_states
 from gridworld.world.sources.gymnasium_table import make_env
 from gridworld.world.wrappers import refuse_transformed
 
@@ -77,8 +79,13 @@ def enumerate_env(
             limit = limit if limit is not None and limit > 0 else None  # -1 is "none" to `gymnasium.make`
             search.explore(limit)
             mdp = search.compiled(limit)
-            found_limit = _Replay(search, mdp).check(make_env(env_id, kwargs))
+            found_limit = _Replay(search, mdp, make_env(env_id, kwargs)).check()
             refuse_transformed(f"env.id={env_id}", env)
+        except UnreadableError as error:
+            raise InputError(
+                f"env.id={env_id}: its state cannot be compared: {error}; hold numbers, lists and numpy "
+                "arrays, or name in env.ignore what nothing depends on"
+            ) from error
         finally:
             env.close()
     return replace(mdp, max_episode_steps=found_limit)
@@ -135,15 +142,16 @@ class _Search:
 
     def _check_start(self) -> None:
         self._env.reset(seed=0)
+        assert self._env.np_random is not None  # it is made when it is first asked for
         if unknown := [each for each in self.ignore if each not in vars(self._env)]:
             raise InputError(
                 f"env.ignore={list(self.ignore)}: {self.name} has no attribute {unknown[0]}; it has "
                 f"{', '.join(vars(self._env))}"
             )
-        key, before = self._key(), self._snapshots.keys(self.ignore)
+        key, before = self._snapshots.key(self.ignore), self._snapshots.keys(self.ignore)
         for seed in range(_RESETS):
             self._env.reset(seed=seed)
-            if self._key() != key:
+            if self._snapshots.key(self.ignore) != key:
                 now = self._snapshots.keys(self.ignore)
                 changed = _listed(name for name, each in now.items() if each != before.get(name))
                 remedy = self._remedy or (
@@ -159,18 +167,14 @@ class _Search:
     def _remedy(self) -> str:
         return "; it has a transition table, so use env=gymnasium" if hasattr(self._env, "P") else ""
 
-    def _key(self) -> bytes:
-        try:
-            return self._snapshots.key(self.ignore)
-        except (TypeError, ValueError, RecursionError) as error:
-            raise self.refusal(f"its state cannot be compared: {error}") from error
-
     def explore(self, limit: int | None) -> None:
         """Find all states that can be reached, and what every action does there.
 
         Episodes are over at the step limit. What lies beyond it is kept too if it is little.
         """
         observation, _ = self._env.reset(seed=0)
+        outside = Reach(f"env.id={self.name}", self._env, "step", skips=True)
+        before = outside.content(is_outside=True)
         start = self._state_after(observation, 0)
         start.is_open = True
         waiting, size = [start], 0
@@ -196,10 +200,16 @@ class _Search:
                 if not (step.terminated or step.truncated or following.is_open):
                     following.is_open = True
                     waiting.append(following)
+        kept = self._snapshots.changed()
+        if kept is not None or outside.content(is_outside=True) != before:
+            raise self.refusal(
+                f"a step changes {type(kept).__name__ if kept else 'what is outside of its attributes'}, of "
+                "which no copies can be made; hold what changes in attributes: numbers, lists, numpy arrays"
+            )
 
     def _tried(self, state: _State) -> list[_Step]:
         """What each action does in a copy of a state."""
-        steps, before = [], random_states(self._env)
+        steps, before = [], (self._snapshots.random_states(), random_states())
         for action in range(self._num_actions):
             self._snapshots.put_back(state.copy)
             try:
@@ -208,7 +218,7 @@ class _Search:
                 raise self.refusal(f"a step with action {action} fails: {error}") from error
             following = self._state_after(observation, state.depth + 1)
             steps.append(_Step(following.number, float(reward), bool(terminated), bool(truncated)))
-        if random_states(self._env) != before:
+        if (self._snapshots.random_states(), random_states()) != before:
             raise self.refusal(f"a step draws a random number, so it is not deterministic{self._remedy}")
         if state.number % _SAMPLED:
             self._num_bytes -= len(state.copy)
@@ -223,7 +233,7 @@ class _Search:
             raise self.refusal(f"its state cannot be copied: {error}") from error
         short, seen = digest(copy), digest(observation)
         if (state := self._by_copy.get(short)) is None:
-            key = self._key()
+            key = self._snapshots.key(self.ignore)
             state = self._by_key.get(key) or self._added(key, seen, depth, copy, observation)
             self._by_copy[short] = state
         if state.seen != seen:
@@ -366,16 +376,17 @@ def _listed(names: Iterable[str]) -> str:
 class _Replay:
     """Walks through an environment that must be those of its table."""
 
-    def __init__(self, search: _Search, mdp: Mdp) -> None:
+    def __init__(self, search: _Search, mdp: Mdp, env: gym.Env[Any, Any]) -> None:
         self._search, self._mdp, self._limit = search, mdp, mdp.max_episode_steps
         self._random = np.random.default_rng(_SEED)
+        self._env, self._snapshots = env, Snapshots(env.unwrapped)
         self._steps = 0  # of this episode
         origins = np.repeat(np.arange(mdp.num_states), mdp.num_actions)
         leads = np.ones(len(origins)), (origins, mdp.next_state.ravel())
         self._moves = csr_array(leads, shape=(mdp.num_states, mdp.num_states))
 
-    def check(self, env: gym.Env[Any, Any]) -> int | None:
-        """Walk a new environment, with the wrappers of its id, to states drawn at random, and close it.
+    def check(self) -> int | None:
+        """Walk the new environment, with the wrappers of its id, to states drawn at random, and close it.
 
         Returns the step limit: the table's, or what the walks found.
         """
@@ -383,24 +394,24 @@ class _Replay:
         try:
             while steps < _STEPS or episodes < _EPISODES:
                 most = _LONGEST if self._search.ignore and not episodes else _LONG
-                self._walk(env, most, episodes % 3 * _AT_RANDOM)
+                self._walk(most, episodes % 3 * _AT_RANDOM)
                 steps, episodes = steps + self._steps, episodes + 1
         finally:
-            env.close()
+            self._env.close()
         return self._limit
 
-    def _walk(self, env: gym.Env[Any, Any], most: int, at_random: int) -> None:
+    def _walk(self, most: int, at_random: int) -> None:
         """Walk to one state after the other, with random steps between, until the episode ends."""
         mdp, state, actions = self._mdp, int(self._mdp.start_states[0]), list[int]()
-        observation, _ = env.reset(seed=int(self._random.integers(2**31)))
+        observation, _ = self._env.reset(seed=int(self._random.integers(2**31)))
         self._steps, truncated = 0, False
-        self._compare_state(env, observation, state)
+        self._compare_state(observation, state)
         while self._steps < most and not mdp.terminal[state] and not truncated:
             if not actions:
                 actions = self._way_from(state)
                 actions += self._random.integers(mdp.num_actions, size=at_random).tolist()
             action = actions.pop(0)
-            observation, reward, terminated, truncated, _ = env.step(action)
+            observation, reward, terminated, truncated, _ = self._env.step(action)
             self._steps += 1
             self._compare("reward", float(reward), float(mdp.reward[state, action, 0]))
             state = int(mdp.next_state[state, action, 0])
@@ -410,7 +421,7 @@ class _Replay:
             is_end = bool(mdp.terminal[state])
             is_cut = not is_end and self._limit is not None and self._steps >= self._limit
             self._compare("end (terminated, truncated)", [bool(terminated), truncated], [is_end, is_cut])
-            self._compare_state(env, observation, state)
+            self._compare_state(observation, state)
 
     def _way_from(self, state: int) -> list[int]:
         """The actions by which to come to a state drawn at random, first to one where it goes on."""
@@ -425,9 +436,9 @@ class _Replay:
             target = origin
         return way[::-1] or [int(self._random.integers(mdp.num_actions))]
 
-    def _compare_state(self, env: gym.Env[Any, Any], observation: Any, state: int) -> None:
+    def _compare_state(self, observation: Any, state: int) -> None:
         expected = self._search.states[self._mdp.number[state]]
-        found = Snapshots(env.unwrapped).key(self._search.ignore), digest(observation)
+        found = self._snapshots.key(self._search.ignore), digest(observation)
         self._compare("state", found, (expected.key, expected.seen))
 
     def _compare(self, what: str, found: Any, expected: Any) -> None:

@@ -28,7 +28,7 @@ from gridworld.world.sources.table_walk import walk
 from gridworld.world.wrappers import copied, refuse_transformed, step_limit
 
 # What was found of Gymnasium's own classes by their tables, which are walked once in a process.
-_WALKED: dict[tuple[type, str] | None, str] = {}
+_WALKED: dict[Any, str] = {}
 
 
 def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Mdp:
@@ -59,7 +59,7 @@ def compile_table(real: gym.Env[Any, Any], limit: int | None = None, name: str |
     if own := {"step", "reset"} & vars(real).keys():
         raise InputError(f"{called}: its {own.pop()}() was replaced, so it cannot be solved exactly")
     is_gymnasiums = type(real).__module__.startswith("gymnasium.envs.")
-    key = (type(real), mdp.text()) if is_gymnasiums and name is None else None
+    key = (type(real).step, type(real).reset, mdp.text()) if is_gymnasiums and name is None else None
     truth = _WALKED.get(key) or _check_steps(mdp, table, copied(real))
     if key is not None:
         _WALKED[key] = truth

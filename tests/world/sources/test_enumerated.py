@@ -1,12 +1,14 @@
 """Deterministic environments become tables; whatever is not deterministic is refused with a reason."""
 
 import random
+import time
 from collections import deque
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 
 from gridworld.errors import InputError
@@ -28,6 +30,11 @@ NO_OBSERVATIONS: dict[str, tuple[gym.Space[Any], Any]] = {  # what does not fit 
     "no image": (spaces.Dict(image=IMAGE), {"picture": np.zeros((2, 2), np.uint8)}),
     "no dict": (spaces.Dict(image=IMAGE), 3),
 }
+
+
+def by_closure() -> Any:
+    count = [0]
+    return lambda: count.append(0)
 
 
 class Corridor(gym.Env[Any, int]):
@@ -233,7 +240,7 @@ def test_states_beyond_the_step_limit_that_have_an_end_are_found() -> None:
         ("Corridor-v0", {"variant": "random"}, "draws a random number"),
         ("Corridor-v0", {"variant": "global"}, "draws a random number"),
         ("Corridor-v0", {"variant": "layout"}, "a reset does not always lead to the same state"),
-        ("ShortCorridor-v0", {"variant": "hidden"}, "is random, has state outside its attributes"),
+        ("ShortCorridor-v0", {"variant": "hidden"}, "a step changes what is outside of its attributes"),
         ("Corridor-v0", {"variant": "endless"}, "more than 300 states .* since its past keeps changing"),
         ("Corridor-v0", {}, r"since its steps keeps changing; .* e.g. env.ignore=\[steps\]"),
         ("Corridor-v0", {"variant": "decay", "limit": 200}, "more than 300 states .* steps keeps changing"),
@@ -253,6 +260,44 @@ def test_what_cannot_be_enumerated_is_refused(env_id: str, kwargs: dict[str, Any
     with pytest.raises(InputError, match=f"^env.*{env_id}.*{reason}") as refused:
         enumerate_env(env_id, kwargs, most_states=300)
     assert "\n" not in str(refused.value)
+
+
+class Holding(Corridor):
+    """Holds something, and does something with it in every step, which its state should show."""
+
+    calls = 0
+    made = use = staticmethod(lambda *_: None)
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__(limit=9)
+        self.held = self.made()
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.use(self)
+        return super().step(action)
+
+
+# fmt: off
+HELD: dict[str, tuple[Any, Any, str]] = {  # what is held, what a step does, what is said
+    "a generator": (lambda: [np.random.default_rng(0)], lambda env: env.held[0].random(), "draws a random"),
+    "a closure": (by_closure, lambda env: env.held(), "a step changes function"),
+    "a tensor": (lambda: torch.zeros(1), lambda env: env.held.add_(1), "its held holds a Tensor"),
+    "a masked array": (lambda: np.ma.array([1]), lambda env: None, "its held holds a MaskedArray"),
+    "a class": (lambda: 0, lambda env: setattr(type(env), "calls", 1), "what is outside of its attributes"),
+    "a clock": (lambda: 0, lambda env: time.time(), "refers to time.time"),
+    "a new generator": (lambda: 0, lambda env: np.random.default_rng(), "refers to numpy.random.default_rng"),
+}
+# fmt: on
+
+
+@pytest.mark.parametrize("what", HELD)
+def test_what_cannot_be_copied_or_is_left_to_chance_is_refused(what: str) -> None:
+    made, use, told = HELD[what]
+    members = {"made": staticmethod(made), "use": staticmethod(use)}
+    gym.register("Holding-v0", entry_point=type("Held", (Holding,), members))
+    with pytest.raises(InputError, match=f"^env.id=Holding-v0: .*{told}"):
+        enumerate_env("Holding-v0")
+    del gym.registry["Holding-v0"]
 
 
 @pytest.mark.parametrize("variant", NO_OBSERVATIONS)
