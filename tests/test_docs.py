@@ -21,6 +21,9 @@ CLAIMS: dict[str, tuple[str, list[str]]] = {  # by a part of a command: what it 
     "observation=coordinates": ("certified optimal since step", ["evaluation.stop_after=1"]),
     "observation=image": ("certified optimal since step", ["evaluation.stop_after=1"]),
     "train.py --help": ("Choices:", []),
+    "check.py q_learning": ("passed all", ["--processes", "1"]),
+    "check.py stable_baselines3.A2C": ("1 probe", ["--processes", "1"]),
+    "MiniGrid-Empty-5x5-v0": ("enumerated", ["env.kwargs={max_steps: 20}", "total_timesteps=1000"]),
 }
 
 

@@ -1,7 +1,7 @@
 """Play a world yourself, alone or next to a trained agent, and see how far you are from optimal.
 
 The agent takes a step whenever you do, and continues alone when your episode is over. O shows the optimal
-policy, by arrows over a map, in words below a picture of Gymnasium's.
+policy, by arrows over a map, in words above a picture of Gymnasium's.
 """
 
 from __future__ import annotations

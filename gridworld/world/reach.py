@@ -95,7 +95,8 @@ class Reach:
         skips: bool = False,
     ) -> None:
         self._known = [owner, *known]  # not read
-        self._owner, self._names, self._by_name = owner, {method, *_OF_ITS_OWN}, False
+        self._owner, self._by_name = owner, False
+        self.names = {method, *_OF_ITS_OWN}
         self._met: dict[int, Any] = {id(each): each for each in self._known}
         self._modules: list[Mapping[str, Any]] = []
         self._classes: dict[tuple[int, bool], tuple[Mapping[str, Any], bool]] = {}
@@ -148,7 +149,7 @@ class Reach:
     def _named(self) -> Iterator[tuple[Mapping[str, Any], str]]:
         """Every place where a name that is used may be meant."""
         shows = ("render", "_render", "close") if self._package else ()  # what is no part of a step
-        names = sorted(name for name in self._names if not name.startswith(shows))
+        names = sorted(name for name in self.names if not name.startswith(shows))
         mine: Any = vars(self._owner)
         yield from ((mine, name) for name in [*names, *(mine if self._by_name else ())] if name != "env")
         yield from ((module, name) for module in self._modules for name in [*names, "__getattr__"])
@@ -240,8 +241,8 @@ class Reach:
                 self._look_up(names if name in names or not hasattr(builtins, name) else vars(builtins), name)
             elif what.endswith(("_ATTR", "_METHOD", "IMPORT_FROM")):
                 self._by_name |= name in _BY_NAME
-                self._names.add(name)
-        self._names |= set(_words(code.co_consts))
+                self.names.add(name)
+        self.names |= set(_words(code.co_consts))
 
 
 def _words(constants: Iterable[Any]) -> Iterator[str]:

@@ -179,16 +179,27 @@ class Wrapped:
                 f"{self._where}: action_masks() is not available for each state, since the state of "
                 f"{type(env.unwrapped).__name__} cannot be set; use a model without masks"
             )
-        within = [
-            Reach(self._where, each, "action_masks", chain) for each in chain if hasattr(each, "action_masks")
-        ]
-        before = [each.content(is_outside=True) for each in within]
-        found = np.ones((self._bare.num_states, self.mdp.num_actions), dtype=np.bool_)
+        within = {
+            each: Reach(self._where, each, "action_masks", chain)
+            for each in chain
+            if hasattr(each, "action_masks")
+        }
+
+        def contents() -> list[bytes]:
+            return [reach.content(is_outside=each is env.unwrapped) for each, reach in within.items()]
+
+        for wrapper in self._left_out:
+            own = vars(wrapper).keys() - vars(gym.Wrapper(wrapper.env)).keys()
+            if read := {name for each in within.values() for name in each.names & own}:
+                raise InputError(
+                    f"{self._where}: action_masks() reads {min(read)} of {type(wrapper).__name__}{SO_UNKNOWN}"
+                )
+        before, found = contents(), np.ones((self._bare.num_states, self.mdp.num_actions), dtype=np.bool_)
         for state in np.flatnonzero(self._bare.acting).tolist():
             setattr(env.unwrapped, self._attribute, int(self._bare.number[state]))
             with self._refusing("action_masks() failed"):
                 found[state] = masks()
-                if [each.content(is_outside=True) for each in within] != before:
+                if contents() != before:
                     raise InputError(f"{self._where}: action_masks() keeps memory{SO_UNKNOWN}")
 
         def compare(number: int, observation: Any) -> None:
@@ -206,6 +217,7 @@ class Wrapped:
         """A copy of the environment to step: of its wrappers only those that transform, and custom ones."""
         env: Any = _Probe(copied(self._env.unwrapped))
         self._probe, seen = env, {id(self._env.unwrapped): env.unwrapped}
+        self._left_out: list[Any] = []
         for wrapper in list(wrappers_of(self._env))[::-1]:
             kind = type(wrapper)
             is_custom = kind.step is gym.Wrapper.step and kind.reset is gym.Wrapper.reset
@@ -218,6 +230,8 @@ class Wrapped:
                         "so its effect cannot be determined; leave it out"
                     ) from None
                 other.env, env = env, other
+            else:
+                self._left_out.append(wrapper)
             seen[id(wrapper)] = env
         with self._refusing("cannot be reset"):
             env.reset()

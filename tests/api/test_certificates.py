@@ -593,6 +593,11 @@ def never_back(env: Any) -> Any:
     return ActionMasker(env, allowed)
 
 
+def counting_masks(wrapper: Any) -> Any:
+    wrapper.calls += 1
+    return np.arange(4) != (wrapper.calls > 10**6)
+
+
 @pytest.mark.parametrize("masking", [only_left, never_back])
 def test_a_model_with_masks_is_scored_with_them(masking: Any) -> None:
     for seed in range(6):
@@ -610,7 +615,9 @@ def test_a_model_with_masks_is_scored_with_them(masking: Any) -> None:
     random_masks = ActionMasker(lake(), lambda _: DRAWS.random(4) < 0.9)
     outside = lake()
     elsewhere = ActionMasker(lake(), lambda _: np.arange(4) != outside.unwrapped.s)
-    for env in (random_masks, elsewhere):
+    timed = ActionMasker(lake(), lambda env: np.arange(4) != (getattr(env, "_elapsed_steps", 0) > 50))
+    counted = own(gym.Wrapper, calls=0, action_masks=counting_masks)(lake())
+    for env in (random_masks, elsewhere, timed, counted):
         with pytest.raises(InputError):
             gridworld.evaluate(model, env)
 

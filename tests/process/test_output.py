@@ -71,6 +71,15 @@ def test_progress(
     assert capsys.readouterr().err == ""
 
 
+def test_progress_on_a_narrow_terminal_keeps_the_regret(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    console.Progress(200_000, "expected_sarsa on frozen_lake_4x4").update(1_000, "regret 0.542, goal 50%")
+    assert capsys.readouterr().err == "\rstep 1,000 of 200,000 (0%), regret 0.542, goal 50%"
+
+
 @pytest.mark.parametrize("environment", [NO_UTF8, ASCII], ids=["no UTF-8", "ASCII"])
 def test_names_in_a_locale_without_utf8(environment: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / MAP).write_text("S..\n..G\n")

@@ -3,9 +3,10 @@
     search    the states and what each action does there; everything that changes is state, the time included
     replay    the environment itself beside the table, thousands of steps: any difference is refused
 
-The replay is for what an enumeration may miss: randomness that no generator of the environment shows, state
-outside of its attributes or in those that it was told to leave out, or a wrapper. With attributes that a user
-names as no part of a state, the claim rests on that, and `truth` says so.
+A state is read exactly or refused (`reading`). The search refuses generators that a step draws from, wherever
+the state holds them, spaces and functions that change, and changes outside the attributes. The replay is for
+what that may miss, such as attributes that the user told it to leave out, or a wrapper. With attributes that
+a user names as no part of a state, the claim rests on that, and `truth` says so.
 
 The step limit is that of the id or the one at which the environment truncates by itself. A state at the limit
 is not terminal, since the environment does not say so, but every action stays there and pays nothing.

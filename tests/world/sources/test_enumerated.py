@@ -326,7 +326,7 @@ class Counted(Corridor):
 
 def test_what_changes_with_every_episode_is_named() -> None:
     gym.register("Counted-v0", entry_point=Counted)
-    with pytest.raises(InputError, match=r"at another time \(in episodes\).*env.ignore"):
+    with pytest.raises(InputError, match=r"the same state \(in episodes\).*env.ignore"):
         enumerate_env("Counted-v0", {"limit": 9})
     assert enumerate_env("Counted-v0", {"limit": 9}, ignore=["episodes", "steps"]).num_states == CELLS
     del gym.registry["Counted-v0"]
