@@ -12,10 +12,8 @@ Importing it registers the environment and loads nothing else; torch is imported
 The names are in `__init__.pyi`.
 """
 
-import sys
-
+from gridworld.base.workarounds import when_gymnasium_is_imported as _when_gymnasium_is_imported
 from gridworld.envs.registration import register_envs as _register_envs
-from gridworld.workarounds import when_gymnasium_is_imported as _when_gymnasium_is_imported
 
 __version__ = "0.1.0"  # pyproject.toml reads it here
 
@@ -23,16 +21,6 @@ with open(f"{__file__}i", encoding="utf-8") as _file:  # "from MODULE import NAM
     _MODULES = {line.split()[-1]: line.split()[1] for line in _file if line.startswith("from ")}
 
 __all__ = list(_MODULES)
-
-
-class _Package(type(sys)):
-    def __setattr__(self, name: str, value: object) -> None:
-        """Leave the functions `sweep` and `tune` where they are, which have the names of packages."""
-        if name not in _MODULES or not isinstance(value, type(sys)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
 
 
 def __dir__() -> list[str]:

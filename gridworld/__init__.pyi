@@ -14,6 +14,7 @@ from gridworld.api.sweeps import tune as tune
 from gridworld.api.worlds import compile_env as compile_env
 from gridworld.api.worlds import evaluate as evaluate
 from gridworld.api.worlds import make_vec as make_vec
+from gridworld.base.errors import InputError as InputError
 from gridworld.checking.run import CheckResult as CheckResult
 from gridworld.checking.run import check as check
 from gridworld.envs.env import GridWorldEnv as GridWorldEnv
@@ -26,7 +27,6 @@ from gridworld.envs.observations import VectorOneHotObservation as VectorOneHotO
 from gridworld.envs.registration import ENV_ID as ENV_ID
 from gridworld.envs.registration import register_envs as register_envs
 from gridworld.envs.vector_env import GridWorldVectorEnv as GridWorldVectorEnv
-from gridworld.errors import InputError as InputError
 from gridworld.world.evaluation import Evaluator as Evaluator
 from gridworld.world.evaluation import Score as Score
 from gridworld.world.grid import compile_mdp as compile_mdp

@@ -1,6 +1,6 @@
 """The console command `gridworld`, also `python -m gridworld`; see `gridworld.commands`."""
 
-from gridworld.process.signals import listen
+from gridworld.base.signals import listen
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """Measure this project and its peers: `python scripts/benchmark.py`; see `--help`."""
 
-from gridworld.process.signals import listen
+from gridworld.base.signals import listen
 
 if __name__ == "__main__":
     listen()  # before what takes time to import

@@ -1,6 +1,6 @@
 """Hand finished runs to W&B, MLflow or the Hub: `python scripts/export.py runs/...`; see `--help`."""
 
-from gridworld.process.signals import listen
+from gridworld.base.signals import listen
 
 if __name__ == "__main__":
     listen()  # before what takes time to import

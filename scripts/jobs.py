@@ -1,6 +1,6 @@
 """Show how the jobs of a sweep stand: `python scripts/jobs.py runs/...`; see `--help`."""
 
-from gridworld.process.signals import listen
+from gridworld.base.signals import listen
 
 if __name__ == "__main__":
     listen()  # before what takes time to import

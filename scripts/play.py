@@ -1,6 +1,6 @@
 """Play a world with the arrow keys: `python scripts/play.py --layout maze`; see `--help`."""
 
-from gridworld.process.signals import listen
+from gridworld.base.signals import listen
 
 if __name__ == "__main__":
     listen()  # before what takes time to import

@@ -1,6 +1,6 @@
 """Put many runs side by side, as one page: `python scripts/report.py runs/...`; see `--help`."""
 
-from gridworld.process.signals import listen
+from gridworld.base.signals import listen
 
 if __name__ == "__main__":
     listen()  # before what takes time to import

@@ -1,6 +1,6 @@
 """Run a run again and compare bit for bit: `python scripts/reproduce.py runs/...`; see `--help`."""
 
-from gridworld.process.signals import listen
+from gridworld.base.signals import listen
 
 if __name__ == "__main__":
     listen()  # before what takes time to import

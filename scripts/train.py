@@ -1,6 +1,6 @@
 """Train an agent: `python scripts/train.py agent=dqn`; `--help` tells the rest."""
 
-from gridworld.process.signals import listen
+from gridworld.base.signals import listen
 
 if __name__ == "__main__":
     listen()  # before what takes time to import

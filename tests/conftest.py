@@ -18,8 +18,8 @@ import pytest
 from helpers.quickly import compose_quickly
 from hypothesis import settings
 
-from gridworld.process import console
-from gridworld.workarounds import keep_compiler_out
+from gridworld.base import console
+from gridworld.base.workarounds import keep_compiler_out
 
 # The package and the tests are compiled once, not in every process.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -1,4 +1,4 @@
-"""What has changed in a dependency when one of `gridworld.workarounds` breaks."""
+"""What has changed in a dependency when one of `gridworld.base.workarounds` breaks."""
 
 import subprocess
 import sys
@@ -6,7 +6,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 
-from gridworld.workarounds import blas_threads, generator_of
+from gridworld.base.workarounds import blas_threads, generator_of
 
 
 def python(code: str) -> str:
@@ -45,7 +45,7 @@ def test_the_threads_of_numpys_openblas_are_set() -> None:
 def test_an_optimiser_that_makes_no_step_imports_no_compiler() -> None:
     code = """
 import sys, torch
-from gridworld.workarounds import keep_compiler_out
+from gridworld.base.workarounds import keep_compiler_out
 keep_compiler_out()
 weights = torch.ones(2, requires_grad=True)
 optimizer = torch.optim.Adam([weights])

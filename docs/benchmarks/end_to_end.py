@@ -13,7 +13,7 @@ from functools import partial
 from benchmarks import peers
 from benchmarks.measure import Comparison, Workload
 
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 
 _STEPS = 20_000  # of environment, beside RL Zoo
 

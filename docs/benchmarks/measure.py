@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from gridworld.process.console import aligned
+from gridworld.base.console import aligned
 
 Measure = Callable[[], float]  # returns a measurement in the unit of its table
 

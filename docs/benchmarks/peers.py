@@ -12,7 +12,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 
 # NAVIX's own PPO on Empty-5x5, compiled; the second of two runs is timed, when nothing is left to compile.
 _NAVIX = """

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 import gridworld
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.solver import value_iteration

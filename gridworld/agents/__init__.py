@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from gridworld.base.serialization import State
     from gridworld.envs.observations import ObservationTable
     from gridworld.envs.statistics_env import StatisticsVectorEnv
-    from gridworld.storage.serialization import State
     from gridworld.world.mdp import FloatArray, IntArray
 
 WriteScalars = Callable[[Mapping[str, float], int], None]  # ({tag: value}, environment steps)

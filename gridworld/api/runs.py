@@ -21,20 +21,20 @@ from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot
 from gridworld.api.settings import Override, words
+from gridworld.base.errors import InputError, failure
+from gridworld.base.signals import Interrupted
+from gridworld.base.user_input import limited
 from gridworld.config.compose import compose as compose_words
 from gridworld.config.train import TrainConfig
 from gridworld.diagnosis import verdict
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.envs.rendering import Frame
-from gridworld.errors import InputError, failure
-from gridworld.process.signals import Interrupted
-from gridworld.process.user_input import limited
 from gridworld.report.evidence import read_columns
-from gridworld.restore.resume import unfinished_of
-from gridworld.restore.saved_run import SavedRun, read_visits
 from gridworld.run import summary as run_summary
 from gridworld.run.folder import claimed
 from gridworld.run.reader import check_free, is_started
+from gridworld.training.resume import unfinished_of
+from gridworld.training.saved_run import SavedRun, read_visits
 from gridworld.training.setup import without_pictures
 from gridworld.training.train import train as train_in
 from gridworld.visualization.files import encode_png

@@ -12,11 +12,11 @@ import numpy as np
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
+from gridworld.base.errors import InputError
 from gridworld.config.compose import compose as compose_words
 from gridworld.config.recipe_file import literal, with_recipe
 from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
-from gridworld.errors import InputError
 
 Override = str | Mapping[str, Any]
 

@@ -23,21 +23,21 @@ from typing import Any
 
 from gridworld.api.runs import RunResult, open_run
 from gridworld.api.settings import Override, command_words
+from gridworld.base.console import ProgressLine, printable
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import limited
 from gridworld.config.recipe_file import literal
-from gridworld.errors import InputError
-from gridworld.process.console import ProgressLine, printable
-from gridworld.process.user_input import limited
 from gridworld.report.tuning_study import TuningStudy, find_tunings
 from gridworld.report.writer import PAGE
 from gridworld.run.reader import read_run
-from gridworld.sweep import folder as sweep_folder
-from gridworld.sweep.console import counts_text, results_lines
+from gridworld.sweeps import folder as sweep_folder
+from gridworld.sweeps.console import counts_text, results_lines
 
 # What the process does: it ends with this one, and gets Ctrl-C from this one alone.
 _CALL = """\
 import sys
 from gridworld.__main__ import main
-from gridworld.process.processes import end_with
+from gridworld.base.processes import end_with
 end_with(int(sys.argv.pop(1)))
 main()
 """

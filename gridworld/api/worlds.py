@@ -9,11 +9,11 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from numpy.typing import ArrayLike
 
-from gridworld.bounds import discount
+from gridworld.base.bounds import discount
+from gridworld.base.errors import InputError
 from gridworld.config.compose import named_world
 from gridworld.envs.inspection import Task, task_of, world_of
 from gridworld.envs.vector_env import GridWorldVectorEnv
-from gridworld.errors import InputError
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.mdp import FloatArray, Mdp

@@ -12,11 +12,11 @@ from functools import partial
 from multiprocessing import get_context
 from typing import Any
 
+from gridworld.base.console import aligned
+from gridworld.base.errors import InputError, in_short
 from gridworld.checking.probes import PROBES, Probe, UnmetError
 from gridworld.checking.training import build, settings, subject, train
 from gridworld.config.train import AgentConfig
-from gridworld.errors import InputError, in_short
-from gridworld.process.console import aligned
 
 Outcomes = list[tuple[bool | None, str]]  # of one probe on each seed: see `Finding`
 SEEDS = 3  # of a probe that fails at first: it has failed if it fails on most of them

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from gridworld.agents import Agent, TrainingContext
 from gridworld.agents.sb3.settings import SB3ClassConfig, SB3Config
+from gridworld.base.errors import InputError
 from gridworld.checking.probes import Probe, Trained
 from gridworld.config.train import AgentConfig
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.errors import InputError
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.mdp import Mdp
 

@@ -14,10 +14,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from gridworld.bounds import Bounds, digits
-from gridworld.errors import DISTRIBUTION, EXIT_CODE, InputError, failure
-from gridworld.process.console import CONSOLE, prepare, printing, program, tell_error
-from gridworld.process.signals import Interrupted, at_work
+from gridworld.base.bounds import Bounds, digits
+from gridworld.base.console import CONSOLE, prepare, printing, program, tell_error
+from gridworld.base.errors import DISTRIBUTION, EXIT_CODE, InputError, failure
+from gridworld.base.signals import Interrupted, at_work
 
 # By name, in the order of the manual: what it does.
 COMMANDS = {

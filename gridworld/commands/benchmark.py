@@ -11,11 +11,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from gridworld.base.atomic_write import write_json
+from gridworld.base.console import program
+from gridworld.base.errors import InputError
 from gridworld.commands import parser_of
-from gridworld.errors import InputError
-from gridworld.process.console import program
 from gridworld.run.folder import check_inside, check_writable
-from gridworld.storage.atomic_write import write_json
 
 _DOCS = Path(__file__).resolve().parents[2] / "docs"  # where the measurements are, in the source
 # By the table's name on the command line: its module, imported where it is asked for.

@@ -12,11 +12,11 @@ import sys
 import textwrap
 from collections.abc import Sequence
 
+from gridworld.base.console import printable
 from gridworld.checking.probes import PROBES
 from gridworld.checking.run import check
 from gridworld.checking.training import arguments
 from gridworld.commands import parser_of, whole
-from gridworld.process.console import printable
 
 _PROCESSES = 2
 _FAILED = 1  # the exit code

@@ -6,6 +6,10 @@ import argparse
 import sys
 from collections.abc import Sequence
 
+from gridworld.base.console import aligned, printable, tell, telling_if_slow
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import check_no_link
+from gridworld.base.user_input import limited
 from gridworld.commands import parser_of
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.verdict import (
@@ -16,12 +20,8 @@ from gridworld.diagnosis.verdict import (
     trials_folder,
     try_offers,
 )
-from gridworld.errors import InputError
-from gridworld.process.console import aligned, printable, tell, telling_if_slow
-from gridworld.process.user_input import limited
-from gridworld.restore.saved_run import SavedRun
 from gridworld.run.folder import shown
-from gridworld.storage.safe_read import check_no_link
+from gridworld.training.saved_run import SavedRun
 from gridworld.visualization.files import save_png
 
 PICTURE = "diagnosis.png"

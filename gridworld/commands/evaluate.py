@@ -5,15 +5,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
+from gridworld.base.console import aligned, printable, program, telling_if_slow
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import limited
 from gridworld.commands import parser_of, whole
 from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.rendering import has_display
 from gridworld.envs.rollout import SampledScores, play, sample_episodes
-from gridworld.errors import InputError
-from gridworld.process.console import aligned, printable, program, telling_if_slow
-from gridworld.process.user_input import limited
-from gridworld.restore.saved_run import SavedRun, choose_policy
 from gridworld.run.summary import MOST_NAMED, circles_text
+from gridworld.training.saved_run import SavedRun, choose_policy
 from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.mdp import FloatArray
 from gridworld.world.metrics import METRICS, optimal_score

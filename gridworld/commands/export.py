@@ -14,15 +14,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from gridworld.base.console import printable, telling_if_slow
+from gridworld.base.errors import InputError, reason
+from gridworld.base.safe_read import check_no_link
+from gridworld.base.user_input import limited
 from gridworld.commands import parser_of
-from gridworld.errors import InputError, reason
 from gridworld.export.exported_run import read
 from gridworld.export.targets import TARGETS, check_installed
-from gridworld.process.console import printable, telling_if_slow
-from gridworld.process.user_input import limited
 from gridworld.report.evidence import find_runs
 from gridworld.run.folder import check_inside, check_writable
-from gridworld.storage.safe_read import check_no_link
 
 
 @limited()

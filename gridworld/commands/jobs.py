@@ -7,10 +7,10 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from gridworld.process.console import aligned, printable, program, telling_if_slow
-from gridworld.process.user_input import limited
-from gridworld.sweep.console import counts_text
-from gridworld.sweep.folder import STATUSES, JobRow, open_sweep
+from gridworld.base.console import aligned, printable, program, telling_if_slow
+from gridworld.base.user_input import limited
+from gridworld.sweeps.console import counts_text
+from gridworld.sweeps.folder import STATUSES, JobRow, open_sweep
 from gridworld.world.metrics import regret_text
 
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 import textwrap
 from pathlib import Path
 
+from gridworld.base.console import as_called
 from gridworld.config.words import conf_folder, pairs
-from gridworld.process.console import as_called
 
 _TEXT = """\
 Train an agent on a GridWorld whose optimum is known exactly.

@@ -15,6 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from gridworld.base.console import printable, program, telling_if_slow
+from gridworld.base.errors import InputError
+from gridworld.base.serialization import independent_generator
+from gridworld.base.user_input import limited
 from gridworld.commands import parser_of, whole
 from gridworld.config.compose import compose
 from gridworld.config.train import EvaluationConfig
@@ -22,11 +26,7 @@ from gridworld.config.worlds import GymnasiumConfig, MapConfig
 from gridworld.envs import rendering as drawing
 from gridworld.envs.rendering import Frame
 from gridworld.envs.vector_env import GridWorldVectorEnv
-from gridworld.errors import InputError
-from gridworld.process.console import printable, program, telling_if_slow
-from gridworld.process.user_input import limited
-from gridworld.restore.saved_run import SavedRun
-from gridworld.storage.serialization import independent_generator
+from gridworld.training.saved_run import SavedRun
 from gridworld.visualization.canvas import Canvas
 from gridworld.visualization.episode import RealEnv
 from gridworld.visualization.maps import draw_optimal_actions

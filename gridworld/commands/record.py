@@ -6,16 +6,16 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from gridworld.base.console import printable, telling_if_slow
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import check_no_link
+from gridworld.base.user_input import limited
 from gridworld.commands import parser_of, whole
 from gridworld.config.train import PICTURES
 from gridworld.envs.rendering import frame_size
 from gridworld.envs.rollout import play
-from gridworld.errors import InputError
-from gridworld.process.console import printable, telling_if_slow
-from gridworld.process.user_input import limited
-from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
 from gridworld.run.folder import check_inside, check_writable
-from gridworld.storage.safe_read import check_no_link
+from gridworld.training.saved_run import SavedRun, choose_policy, read_visits
 from gridworld.visualization import files
 from gridworld.visualization.episode import film
 from gridworld.visualization.picture import Subject, drawer

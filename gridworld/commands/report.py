@@ -15,15 +15,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from gridworld.base.console import printable, telling_if_slow
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import limited
 from gridworld.commands import parser_of, whole
-from gridworld.errors import InputError
-from gridworld.process.console import printable, telling_if_slow
-from gridworld.process.user_input import limited
 from gridworld.report.analysis import MOST_SHOWN, Reason, Reasons, gather
 from gridworld.report.grouping import Group
 from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report
-from gridworld.restore.saved_run import SavedRun
 from gridworld.run.folder import check_inside
+from gridworld.training.saved_run import SavedRun
 
 _MOST_DIAGNOSED = 10
 

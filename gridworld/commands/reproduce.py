@@ -15,15 +15,15 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from gridworld.base.console import printable, telling_if_slow
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import limited
 from gridworld.commands import parser_of
-from gridworld.errors import InputError
-from gridworld.process.console import printable, telling_if_slow
-from gridworld.process.user_input import limited
-from gridworld.restore.reproduce import check_whole, compare, lengths, population, repeat
-from gridworld.restore.saved_run import settings_of
 from gridworld.run.folder import MANIFEST, check_inside
 from gridworld.run.provenance import describe, differences, source_differences
 from gridworld.run.reader import RunReader, check_free, open_run, read_run, stored_world
+from gridworld.training.reproduce import check_whole, compare, lengths, population, repeat
+from gridworld.training.saved_run import settings_of
 from gridworld.training.setup import without_pictures
 
 DIFFERENT = 1  # exit code

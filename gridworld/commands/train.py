@@ -25,17 +25,17 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.bounds import digits
+from gridworld.base.atomic_write import check_no_links
+from gridworld.base.bounds import digits
+from gridworld.base.console import tell_error
+from gridworld.base.errors import EXIT_CODE, InputError
+from gridworld.base.user_input import called_from, limited
 from gridworld.commands.manual import manual
 from gridworld.config.compose import VERSION_BASE, completed, register_schemas, to_config
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import conf_folder, own_conf_folders, refuse_unclear, sentence, unreadable_file
-from gridworld.errors import EXIT_CODE, InputError
-from gridworld.process.console import tell_error
-from gridworld.process.user_input import called_from, limited
 from gridworld.run.folder import MANIFEST, SWEEP_JSON, alone_in, check_inside, claimed, shell_path
 from gridworld.run.reader import check_free, check_is_run, is_started
-from gridworld.storage.atomic_write import check_no_links
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 _RESUME, _STEPS = "resume", "total_timesteps"
@@ -120,7 +120,7 @@ class RefuseUsedFolders(Callback):
             check_no_links(Path(config.hydra.run.dir), config.hydra.output_subdir)
         _at_end.enter_context(claimed(folder))
         if (folder / MANIFEST).exists() and is_started(folder):
-            from gridworld.restore.resume import unfinished_of  # here, since it takes a second to import
+            from gridworld.training.resume import unfinished_of  # here, since it takes a second to import
 
             # An interpolation may need what Hydra knows only in the job, where settings are compared again.
             with contextlib.suppress(OmegaConfBaseException):
@@ -174,14 +174,14 @@ def _train(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
 
     run: Callable[[], Summary] = partial(train, config, folder, overrides)
     if is_started(folder):
-        from gridworld.restore.resume import unfinished_of
+        from gridworld.training.resume import unfinished_of
 
         run = unfinished_of(folder, config).resume
     return float(train_and_tell(folder, run, _advice)["regret"])
 
 
 def _advice(folder: Path) -> list[str]:
-    from gridworld.restore.advice import advice  # here, since most runs are certified
+    from gridworld.training.advice import advice  # here, since most runs are certified
 
     return advice(folder)
 
@@ -202,8 +202,8 @@ def resume(words: Sequence[str]) -> None:
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: is read-only; copy the run to a writable folder and resume the copy")
 
-    from gridworld.restore.resume import open_unfinished  # here, since it takes a second to import
     from gridworld.run.summary import train_and_tell
+    from gridworld.training.resume import open_unfinished  # here, since it takes a second to import
 
     with alone_in(folder):
         unfinished = open_unfinished(folder, trust)

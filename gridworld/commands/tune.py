@@ -18,20 +18,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gridworld.commands import parser_of
-from gridworld.commands.manual import choices
-from gridworld.config.words import conf_folder, refuse_unclear
-from gridworld.errors import InputError, install_command
-from gridworld.process.console import (
+from gridworld.base.console import (
     as_called,
     command_line,
     printable,
     program,
     tell_error,
 )
+from gridworld.base.errors import InputError, install_command
+from gridworld.commands import parser_of
+from gridworld.commands.manual import choices
+from gridworld.config.words import conf_folder, refuse_unclear
 
 if TYPE_CHECKING:
-    from gridworld.tune.study_spec import StudySpec
+    from gridworld.sweeps.tune.study_spec import StudySpec
 
 _KINDS = ("job", "all")  # of --cfg
 _EPILOG = """\
@@ -71,15 +71,15 @@ def main(arguments: Sequence[str]) -> None:
     if options.config_dir is not None and not options.config_dir.is_dir():
         raise InputError(f"--config-dir {options.config_dir}: no such folder")
     own = (options.config_dir,) if options.config_dir is not None else ()
-    from gridworld.tune.study_spec import compose_study
+    from gridworld.sweeps.tune.study_spec import compose_study
 
     spec = compose_study(options.overrides, own)
     if options.cfg:
         _show(spec, options.cfg, options.package)
         return
-    from gridworld.process.signals import Interrupted
-    from gridworld.tune.search import SearchError
-    from gridworld.tune.study import tune
+    from gridworld.base.signals import Interrupted
+    from gridworld.sweeps.tune.search import SearchError
+    from gridworld.sweeps.tune.study import tune
 
     try:
         tune(spec)

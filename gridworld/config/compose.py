@@ -22,13 +22,13 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from gridworld.base.errors import InputError
 from gridworld.config.presets import may_need_preset, with_preset
 from gridworld.config.settings import agent_schemas
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SearchConfig, SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import conf_folder, is_override, meant, own_conf_folders, prepared, sentence
 from gridworld.config.worlds import SOURCES, EnvConfig, GymnasiumConfig, MapConfig
-from gridworld.errors import InputError
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
     from gridworld.world.mdp import Mdp

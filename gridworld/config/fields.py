@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum, auto
 from typing import Annotated, Any
 
-from gridworld.bounds import Bounds
-from gridworld.errors import InputError
+from gridworld.base.bounds import Bounds
+from gridworld.base.errors import InputError
 
 MISSING = "???"  # OmegaConf's sign for a value that has to be given
 MOST_KEPT = 10**9  # episodes that a mean is taken over

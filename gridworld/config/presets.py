@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from gridworld.base.errors import InputError
 from gridworld.config.settings import has_own_code
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.config.words import conf_folder
 from gridworld.config.worlds import EnvConfig, compiled
-from gridworld.errors import InputError
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
     from gridworld.world.mdp import Mdp

@@ -17,13 +17,13 @@ import yaml
 from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import OmegaConf
 
-from gridworld.bounds import LARGEST_INTEGER
+from gridworld.base.bounds import LARGEST_INTEGER
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import as_text, read_bytes
 from gridworld.config.fields import MISSING
 from gridworld.config.settings import check_foreign, foreign, settings_of_a_run
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import is_override
-from gridworld.errors import InputError
-from gridworld.storage.safe_read import as_text, read_bytes
 
 KEY = "recipe"
 TRUST = "trust"

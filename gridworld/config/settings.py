@@ -18,6 +18,9 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
+from gridworld.base.console import printable
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import users_folder
 from gridworld.config.fields import (
     EFFECTS,
     LIBRARIES,
@@ -31,9 +34,6 @@ from gridworld.config.fields import (
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig, TuneConfig
 from gridworld.config.train import AgentConfig, TrainConfig
 from gridworld.config.worlds import SOURCES, EnvConfig, schema_of
-from gridworld.errors import InputError
-from gridworld.process.console import printable
-from gridworld.process.user_input import users_folder
 
 # Where one of these is missing or empty, a run is as those that were made before there was such a setting.
 NEWER = frozenset(

@@ -29,7 +29,7 @@ class SweepConfig:
 class ForksConfig:
     """`hydra/launcher=forks`, the default: populations in forks of the sweep's process, on Linux."""
 
-    _target_: str = "gridworld.sweep.launchers.forks"
+    _target_: str = "gridworld.sweeps.launchers.forks"
     n_jobs: int = -1
 
 
@@ -37,7 +37,7 @@ class ForksConfig:
 class JoblibConfig:
     """`hydra/launcher=joblib`: populations in new processes on this machine, on any system."""
 
-    _target_: str = "gridworld.sweep.launchers.joblib"
+    _target_: str = "gridworld.sweeps.launchers.joblib"
     n_jobs: int = -1
 
 
@@ -45,7 +45,7 @@ class JoblibConfig:
 class SlurmConfig:
     """`hydra/launcher=slurm`; all but the first two are submitit's, by its names."""
 
-    _target_: str = "gridworld.sweep.launchers.slurm"
+    _target_: str = "gridworld.sweeps.launchers.slurm"
     jobs_per_task: int = setting(1, bounds(1))
     array_parallelism: int = setting(256, bounds(1))
     timeout_min: int = setting(60, bounds(1))
@@ -64,7 +64,7 @@ class SlurmConfig:
 class RayConfig:
     """`hydra/launcher=ray`."""
 
-    _target_: str = "gridworld.sweep.launchers.ray"
+    _target_: str = "gridworld.sweeps.launchers.ray"
     init: dict[str, Any] = field(default_factory=dict)
     remote: dict[str, Any] = field(default_factory=dict)
 

@@ -15,7 +15,8 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gridworld.bounds import LARGEST_INTEGER, discount
+from gridworld.base.bounds import LARGEST_INTEGER, discount
+from gridworld.base.errors import InputError
 from gridworld.config.fields import (
     BOUNDS,
     MISSING,
@@ -32,7 +33,6 @@ from gridworld.config.fields import (
     setting,
 )
 from gridworld.config.worlds import SOURCES, EnvConfig, MapConfig
-from gridworld.errors import InputError
 
 MOST_ENVS = 2**17  # eight times the largest batch that any measurement here is faster with
 MOST_BONUS = 10**6  # of exploration; any reward beside it would be lost in the numbers of a network

@@ -13,10 +13,10 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from gridworld.bounds import digits
+from gridworld.base.bounds import digits
+from gridworld.base.errors import InputError, failure
 from gridworld.config.fields import MISSING
 from gridworld.config.settings import all_settings, settings_of_a_run, takes_whole_numbers
-from gridworld.errors import InputError, failure
 
 OF_THE_COMMAND = ("experiment", "recipe", "resume", "trust", "anyway")  # words that look like settings
 _FLOAT = re.compile(r"(?<![\w.$'\"])[-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.'\"])")

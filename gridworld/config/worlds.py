@@ -12,9 +12,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gridworld.bounds import MOST_STEPS, STEP_LIMIT
+from gridworld.base.bounds import MOST_STEPS, STEP_LIMIT
+from gridworld.base.errors import InputError
 from gridworld.config.fields import MISSING, CodePath, EnvId, FilePath, Kwargs, Word, bounds, setting
-from gridworld.errors import InputError
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
     from gridworld.world.grid import GridMdp

@@ -27,11 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot
+from gridworld.base.errors import InputError
 from gridworld.config.fields import LINEAR, falls, parse_schedule
 from gridworld.config.train import TrainConfig
-from gridworld.errors import InputError
 from gridworld.report.evidence import read_columns
-from gridworld.restore.saved_run import SavedRun, read_visits
+from gridworld.training.saved_run import SavedRun, read_visits
 from gridworld.world.chain import Chain, discounted_visits, stopping_states
 from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp

@@ -16,15 +16,15 @@ from pathlib import Path
 
 import numpy as np
 
+from gridworld.base.console import command
+from gridworld.base.errors import InputError
 from gridworld.config.settings import check_foreign
 from gridworld.config.train import TrainConfig
 from gridworld.diagnosis.causes import CAUSES, PHRASES
 from gridworld.diagnosis.causes.objective import recommended_gamma
 from gridworld.diagnosis.evidence import Evidence, Finding, RegretSplit
 from gridworld.envs.rendering import Frame, board_of
-from gridworld.errors import InputError
-from gridworld.process.console import command
-from gridworld.restore.saved_run import SavedRun
+from gridworld.training.saved_run import SavedRun
 from gridworld.visualization.canvas import Canvas, directions, greedy_paths
 from gridworld.visualization.sheet import ORANGES, PAPER, UNREACHABLE, linear
 from gridworld.visualization.state_table import StateTable, table_states

@@ -17,11 +17,11 @@ import numpy as np
 import torch
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
+from gridworld.base.serialization import State
 from gridworld.engine.networks import Array, Networks, make_networks
 from gridworld.engine.population import FEW_STATES, Population, Run, met_states
 from gridworld.engine.replay import CountedReplay, Replay, Transitions, UniformReplay
 from gridworld.envs.vector_env import Step
-from gridworld.storage.serialization import State
 from gridworld.world.mdp import FloatArray, IntArray
 
 _DRAWN_AT_ONCE = 2**13  # transitions of a run

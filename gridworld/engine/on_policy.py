@@ -30,10 +30,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from gridworld.base.serialization import State
 from gridworld.engine.environments import Rollout
 from gridworld.engine.networks import Array
 from gridworld.engine.population import FEW_STATES, Population, Run
-from gridworld.storage.serialization import State
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gridworld.storage.serialization import StateError, fill
+from gridworld.base.serialization import StateError, fill
 from gridworld.world.mdp import BoolArray
 
 # Those that look at every weight by itself.

@@ -14,15 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gridworld.config.fields import Decay
-from gridworld.engine.environments import Environments
-from gridworld.engine.networks import DenseNetworks, Networks, StateNetwork, make_networks
-from gridworld.engine.optimizer import Optimizer
-from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.errors import InputError
-from gridworld.process.console import tell
-from gridworld.process.together import mixed
-from gridworld.storage.serialization import (
+from gridworld.base.console import tell
+from gridworld.base.errors import InputError
+from gridworld.base.serialization import (
     State,
     StateError,
     fill,
@@ -30,6 +24,12 @@ from gridworld.storage.serialization import (
     generator_state,
     set_generator_state,
 )
+from gridworld.base.together import mixed
+from gridworld.config.fields import Decay
+from gridworld.engine.environments import Environments
+from gridworld.engine.networks import DenseNetworks, Networks, StateNetwork, make_networks
+from gridworld.engine.optimizer import Optimizer
+from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 FEW_STATES = 1024  # up to here all states are cheaper than finding out which ones a batch holds

@@ -6,10 +6,10 @@ from collections.abc import Hashable, Iterator, Sequence
 
 import numpy as np
 
+from gridworld.base.serialization import State
 from gridworld.engine.networks import Array
 from gridworld.engine.on_policy import OnPolicy, Sums, log_softmax, losses_and_slopes
 from gridworld.engine.population import Run
-from gridworld.storage.serialization import State
 from gridworld.world.mdp import BoolArray, IntArray
 
 

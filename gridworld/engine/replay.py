@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.storage.serialization import State, StateError, fill
+from gridworld.base.serialization import State, StateError, fill
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 Float32Array = NDArray[np.float32]

@@ -17,11 +17,11 @@ from stable_baselines3.common.utils import FloatSchedule
 from torch import nn
 
 import gridworld.engine
+from gridworld.base.serialization import independent_generator
 from gridworld.engine.networks import StateNetwork, cut
 from gridworld.engine.population import Population, Run
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.storage.serialization import independent_generator
 
 Parameters = Sequence[nn.Parameter]
 

@@ -27,9 +27,9 @@ from gymnasium.vector import VectorEnv, VectorObservationWrapper
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import check_memory
 from gridworld.envs import rendering as drawing
-from gridworld.errors import InputError
-from gridworld.process.user_input import check_memory
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import IntArray, Mdp
 

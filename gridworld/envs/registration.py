@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gridworld.bounds import STEP_LIMIT
+from gridworld.base.bounds import STEP_LIMIT
 
 ENV_ID = "GridWorld-v0"
 

@@ -20,7 +20,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 from gridworld.world.grid import GridMdp
 from gridworld.world.mdp import BoolArray, IntArray, Mdp, frozen
 

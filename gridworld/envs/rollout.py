@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gridworld.base.serialization import independent_generator
 from gridworld.envs.vector_env import GridWorldVectorEnv
-from gridworld.storage.serialization import independent_generator
 from gridworld.world.chain import check_policy
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp

@@ -17,8 +17,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from gridworld.base.serialization import State, fill
 from gridworld.envs.vector_env import GridWorldVectorEnv, StateArray, Step
-from gridworld.storage.serialization import State, fill
 from gridworld.world.mdp import FloatArray
 
 

@@ -14,16 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gridworld.base.console import plain
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import sha256
 from gridworld.config.settings import flat, read_config
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig
-from gridworld.errors import InputError
-from gridworld.process.console import plain
 from gridworld.report.evidence import ONLINE, Evidence, Unusable, read_columns
 from gridworld.report.evidence import read as read_evidence
 from gridworld.run.folder import WORLD
 from gridworld.run.reader import LARGEST_RESULT, RunReader, open_run, stored_world
-from gridworld.storage.safe_read import sha256
 from gridworld.world.metrics import METRICS
 from gridworld.world.sources.arrays import world_bytes
 

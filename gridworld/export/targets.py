@@ -22,14 +22,14 @@ from typing import Any
 
 import yaml
 
+from gridworld.base.atomic_write import replacing_folder, write_json, write_text
+from gridworld.base.errors import InputError, install_command
+from gridworld.base.safe_read import read_object
 from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.envs.registration import ENV_ID
-from gridworld.errors import InputError, install_command
 from gridworld.export.exported_run import ExportedRun
 from gridworld.report.tables import Table, to_markdown
 from gridworld.run.folder import WORLD
-from gridworld.storage.atomic_write import replacing_folder, write_json, write_text
-from gridworld.storage.safe_read import read_object
 from gridworld.world.metrics import METRICS
 
 # What W&B would note of the process that exports would read as if it were of the run.

@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 from gridworld.report import chart
 from gridworld.report.analysis import METRICS, Band, Overall, Result, TaskAnalysis
 from gridworld.report.chart import INK, MUTED, PAPER, Chart, Styles, house_style

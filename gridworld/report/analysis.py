@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gridworld.base.errors import InputError
 from gridworld.config.train import check_bounds
 from gridworld.config.worlds import schema_of
-from gridworld.errors import InputError
 from gridworld.report import statistics
 from gridworld.report.evidence import (
     DAMAGED,

@@ -26,7 +26,7 @@ from matplotlib.patheffects import Normal
 from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from gridworld.process.console import plain
+from gridworld.base.console import plain
 
 INK, MUTED, PAPER = "#1c2430", "#5d6878", "#ffffff"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#b8578f", "#c98500", "#3a9bd9", "#4a4f57")  # of agents

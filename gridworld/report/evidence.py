@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from gridworld.base.console import printable
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import LARGEST_CSV, as_table
 from gridworld.config.settings import NEWER, flat, privileges
-from gridworld.errors import InputError
-from gridworld.process.console import printable
 from gridworld.run.folder import CURVE, MANIFEST, SUMMARY, VISITS
 from gridworld.run.reader import RunReader, read_run
-from gridworld.storage.safe_read import LARGEST_CSV, as_table
 from gridworld.world.mdp import FloatArray
 from gridworld.world.metrics import METRICS
 

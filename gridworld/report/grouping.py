@@ -10,10 +10,10 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from gridworld.base.safe_read import sha256
 from gridworld.config.fields import Effect
 from gridworld.config.settings import effect_of
 from gridworld.report.evidence import Evidence, Settings
-from gridworld.storage.safe_read import sha256
 
 _OF_LEARNING = (Effect.LEARNING, Effect.LENGTH, Effect.EVALUATION)
 _MAP = ("env.layout", "env.num_rows", "env.num_cols")

@@ -11,13 +11,13 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from gridworld.process.console import plain
+from gridworld.base.console import plain
+from gridworld.base.safe_read import csv_text
 from gridworld.report.analysis import METRICS, Comparisons, Overall, Reasons, Report, Result, TaskAnalysis
 from gridworld.report.evidence import Unusable
 from gridworld.report.grouping import Study, differing, learning_key
 from gridworld.report.statistics import Interval, Share
 from gridworld.report.tuning_study import TuningStudy
-from gridworld.storage.safe_read import csv_text
 
 NOTHING = "\N{EN DASH}"
 _MINUS = "\N{MINUS SIGN}"

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gridworld.errors import InputError
-from gridworld.process.console import plain
-from gridworld.process.user_input import check_memory
-from gridworld.storage.safe_read import LARGEST_CSV, as_table, csv_rows, read_bytes, read_sealed, sha256
+from gridworld.base.console import plain
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import LARGEST_CSV, as_table, csv_rows, read_bytes, read_sealed, sha256
+from gridworld.base.user_input import check_memory
 
 STUDY_JSON, TRIALS_CSV = "study.json", "trials.csv"
 TRIALS_SUM = "trials_sha256"  # in the former, of the latter

@@ -21,16 +21,16 @@ from typing import TYPE_CHECKING, Any
 
 from PIL import Image
 
+from gridworld.base.atomic_write import replacing_folder, write_text
+from gridworld.base.console import plain, tell
+from gridworld.base.errors import InputError, reason
+from gridworld.base.safe_read import read_bytes, sha256
 from gridworld.config.train import PICTURES
-from gridworld.errors import InputError, reason
-from gridworld.process.console import plain, tell
 from gridworld.report import statistics, tables
 from gridworld.report.analysis import MOST_SHOWN, Band, Report, Result, TaskAnalysis, gather
 from gridworld.report.tables import to_captioned_markdown, to_csv, to_markdown
 from gridworld.run.folder import EVENTS as EVENT_FILE
 from gridworld.run.folder import SUMMARY, check_writable
-from gridworld.storage.atomic_write import replacing_folder, write_text
-from gridworld.storage.safe_read import read_bytes, sha256
 from gridworld.training.learning_curve import GREEDY, GREEDY_MORE
 from gridworld.training.tensorboard import EventWriter
 

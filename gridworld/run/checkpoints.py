@@ -2,7 +2,7 @@
 
     checkpoints/000000012032.state    after 12,032 steps; `numpy.load` opens it
 
-A power cut harms none, since the files that a checkpoint has marks of (`storage.atomic_write`) are written
+A power cut harms none, since the files that a checkpoint has marks of (`base.atomic_write`) are written
 first. A checkpoint that is damaged, or whose files are, is passed over for the one before.
 """
 
@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from gridworld.errors import InputError
-from gridworld.process.together import clock
-from gridworld.process.user_input import BudgetError
+from gridworld.base.atomic_write import remove_path, sync_folder, write_bytes
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import check_no_link, read_bytes
+from gridworld.base.serialization import State, StateError, decode, encode
+from gridworld.base.together import clock
+from gridworld.base.user_input import BudgetError
 from gridworld.run.folder import CHECKPOINTS
-from gridworld.storage.atomic_write import remove_path, sync_folder, write_bytes
-from gridworld.storage.safe_read import check_no_link, read_bytes
-from gridworld.storage.serialization import State, StateError, decode, encode
 
 _KEPT = 2  # the newest
 _SUFFIX = ".state"

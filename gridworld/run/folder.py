@@ -32,12 +32,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from gridworld.base.atomic_write import inside, locked, make_folder, remove_path, tidy
+from gridworld.base.console import command, printable
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import users_folder
 from gridworld.config import train as schema
 from gridworld.config.settings import foreign
-from gridworld.errors import InputError
-from gridworld.process.console import command, printable
-from gridworld.process.user_input import users_folder
-from gridworld.storage.atomic_write import inside, locked, make_folder, remove_path, tidy
 
 MANIFEST = "manifest.json"
 SOURCE_DIFF = "source.diff"

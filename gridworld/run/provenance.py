@@ -20,12 +20,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gridworld.base.errors import DISTRIBUTION
+from gridworld.base.safe_read import sha256
 from gridworld.config.fields import Effect
 from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import AgentConfig, TrainConfig
-from gridworld.errors import DISTRIBUTION
 from gridworld.run.folder import SOURCE_DIFF
-from gridworld.storage.safe_read import sha256
 
 LARGEST_DIFF = 2**20  # bytes; of a larger one only the checksum is kept
 

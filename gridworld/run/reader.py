@@ -11,9 +11,18 @@ import os
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import (
+    LARGEST_JSON,
+    as_object,
+    check_no_link,
+    file_sha256,
+    read_bytes,
+    read_sealed,
+    sha256,
+)
+from gridworld.base.user_input import COPIES
 from gridworld.config.worlds import EnvConfig, MapConfig
-from gridworld.errors import InputError
-from gridworld.process.user_input import COPIES
 from gridworld.run.folder import (
     CHECKED,
     CHECKPOINTS,
@@ -22,15 +31,6 @@ from gridworld.run.folder import (
     SWEEP_JSON,
     RunFolder,
     check_writable,
-)
-from gridworld.storage.safe_read import (
-    LARGEST_JSON,
-    as_object,
-    check_no_link,
-    file_sha256,
-    read_bytes,
-    read_sealed,
-    sha256,
 )
 
 if TYPE_CHECKING:

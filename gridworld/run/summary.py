@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gridworld.process.console import aligned, printable
-from gridworld.process.signals import Interrupted
-from gridworld.process.user_input import users_folder
+from gridworld.base.console import aligned, printable
+from gridworld.base.signals import Interrupted
+from gridworld.base.user_input import users_folder
 from gridworld.run.folder import EVENTS, RunFolder, shell_path
 from gridworld.run.reader import read_run
 from gridworld.world.metrics import METRICS

@@ -15,16 +15,16 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.errors import InputError
-from gridworld.process.console import TOLD, plain, recorded_command_line
-from gridworld.process.together import mixed
-from gridworld.process.user_input import npz_bytes
+from gridworld.base.atomic_write import remove_path, sync, sync_folder, tidy, write_bytes, write_json
+from gridworld.base.console import TOLD, plain, recorded_command_line
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import check_no_link, file_sha256, sealed
+from gridworld.base.together import mixed
+from gridworld.base.user_input import npz_bytes
 from gridworld.run import provenance
 from gridworld.run.folder import CHECKED, CHECKPOINTS, OUTPUTS, RunFolder
 from gridworld.run.provenance import describe, source_differences
 from gridworld.run.reader import LARGEST_RESULT, NUMBERS_DEPEND_ON, RunReader
-from gridworld.storage.atomic_write import remove_path, sync, sync_folder, tidy, write_bytes, write_json
-from gridworld.storage.safe_read import check_no_link, file_sha256, sealed
 from gridworld.world.grid import GridMdp
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources.arrays import world_bytes

@@ -19,18 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot, WriteScalars
+from gridworld.base.atomic_write import AppendLog
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import csv_text
+from gridworld.base.serialization import State
 from gridworld.config.train import TrainConfig
 from gridworld.envs.statistics_env import NO_EPISODES, Returns, StatisticsVectorEnv
-from gridworld.errors import InputError
 from gridworld.run.writer import NEEDED
-from gridworld.storage.atomic_write import AppendLog
-from gridworld.storage.safe_read import csv_text
-from gridworld.storage.serialization import State
 from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score, regret_text
 
 if TYPE_CHECKING:
-    from gridworld.process.console import Progress
+    from gridworld.base.console import Progress
 
 # TensorBoard sorts its groups by name and opens with the first: the greedy policy's learning curve. Behind it
 # are the greedy policy's other metrics, the sampled policy, and the optimum, which is a flat line.
@@ -134,7 +134,7 @@ class LearningCurve:
         }
 
     def set_state(self, state: State) -> None:
-        """Mirrors `get_state`; inside `storage.serialization.fitting`."""
+        """Mirrors `get_state`; inside `base.serialization.fitting`."""
         self._next = int(state["next"])
         self.certificate = Certificate(
             int(state["streak"]), state["first_certified_step"], state["certified_since_step"]

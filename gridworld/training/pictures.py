@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gridworld.base.errors import InputError
+from gridworld.base.serialization import State
 from gridworld.config.train import PICTURES, Picture, TrainConfig
 from gridworld.envs.rendering import fitting_cell_size
-from gridworld.errors import InputError
-from gridworld.storage.serialization import State
 from gridworld.training.learning_curve import Evaluation
 from gridworld.training.tensorboard import EventWriter
 from gridworld.visualization.animation import Animation

@@ -20,19 +20,19 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.agents import Agent, Learning
+from gridworld.base.atomic_write import AppendLog, sync, write_bytes, write_json
+from gridworld.base.console import Progress, tell
+from gridworld.base.errors import InputError
+from gridworld.base.serialization import State, fitting, npy_bytes
+from gridworld.base.signals import StopRequest
+from gridworld.base.together import clock
 from gridworld.config.settings import privileges
 from gridworld.config.train import AUTO, TrainConfig
-from gridworld.errors import InputError
-from gridworld.process.console import Progress, tell
-from gridworld.process.signals import StopRequest
-from gridworld.process.together import clock
 from gridworld.run.checkpoints import Checkpoints, Pace
 from gridworld.run.folder import CURVE, EVENTS
 from gridworld.run.provenance import environment, identity
 from gridworld.run.summary import MOST_NAMED, Summary
 from gridworld.run.writer import RunWriter, write_evaluations
-from gridworld.storage.atomic_write import AppendLog, sync, write_bytes, write_json
-from gridworld.storage.serialization import State, fitting, npy_bytes
 from gridworld.training.learning_curve import (
     CHARTS,
     CurveScalars,

@@ -8,12 +8,12 @@ from collections.abc import Callable
 from importlib.util import find_spec
 
 from gridworld.agents import TrainingContext, WriteScalars
+from gridworld.base.errors import InputError, install_command
 from gridworld.config.presets import LARGE, STOCHASTIC, fitting_preset, is_recipe_for
 from gridworld.config.train import AUTO, PICTURES, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.errors import InputError, install_command
 from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
 

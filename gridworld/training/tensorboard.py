@@ -27,12 +27,12 @@ from tensorboard.plugins.custom_scalar import metadata as layout_metadata
 from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 from tensorboard.plugins.text import metadata as text_metadata
 
+from gridworld.base.atomic_write import AppendLog
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import open_ordinary
+from gridworld.base.user_input import check_memory
 from gridworld.config.settings import ON_RESULT, flat, with_effects
 from gridworld.config.train import TrainConfig
-from gridworld.errors import InputError
-from gridworld.process.user_input import check_memory
-from gridworld.storage.atomic_write import AppendLog
-from gridworld.storage.safe_read import open_ordinary
 
 HParamValue = bool | float | str | None
 

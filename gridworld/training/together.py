@@ -14,7 +14,7 @@ from contextvars import copy_context
 from typing import Generic, ParamSpec, TypeVar
 
 from gridworld.agents import Learning, learn_together
-from gridworld.process.together import share_clock
+from gridworld.base.together import share_clock
 
 P = ParamSpec("P")
 T = TypeVar("T")

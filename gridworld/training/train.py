@@ -12,17 +12,17 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from gridworld.base.atomic_write import write_text
+from gridworld.base.console import recorded_command_line, tell
+from gridworld.base.errors import FolderLostError, InputError, MachineError, reason
+from gridworld.base.serialization import State, StateError
+from gridworld.base.signals import Interrupted
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, compiled
-from gridworld.errors import FolderLostError, InputError, MachineError, reason
-from gridworld.process.console import recorded_command_line, tell
-from gridworld.process.signals import Interrupted
 from gridworld.run.folder import MANIFEST, RunFolder, shown
 from gridworld.run.reader import is_started
 from gridworld.run.summary import Summary, interruption_text
 from gridworld.run.writer import RunWriter, TrainLog
-from gridworld.storage.atomic_write import write_text
-from gridworld.storage.serialization import State, StateError
 from gridworld.training.session import OnBuilt, Session, ignore
 from gridworld.training.setup import check_settings, notes
 from gridworld.training.together import Training, alone

@@ -11,9 +11,9 @@ from typing import Any
 
 import wandb
 
+from gridworld.base.errors import InputError, in_short
+from gridworld.base.safe_read import sha256
 from gridworld.config.train import TrainConfig
-from gridworld.errors import InputError, in_short
-from gridworld.storage.safe_read import sha256
 from gridworld.training.tensorboard import hparams
 
 

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from gridworld.base.errors import InputError
 from gridworld.envs import rendering as drawing
 from gridworld.envs.rendering import Frame, Packed
 from gridworld.envs.rollout import Episode
-from gridworld.errors import InputError
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import IntArray, Mdp
 

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from gridworld.base.console import printable, tell
+from gridworld.base.errors import InputError, in_short
 from gridworld.config.worlds import EnvConfig, GymnasiumConfig
 from gridworld.envs.rendering import Frame, board_of, frame_size, import_pygame
 from gridworld.envs.rollout import Episode, play
-from gridworld.errors import InputError, in_short
-from gridworld.process.console import printable, tell
 from gridworld.visualization.animation import (
     Animation,
     animation_of_cards,

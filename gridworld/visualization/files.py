@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import GifImagePlugin, ImageChops
 
+from gridworld.base.atomic_write import replacing, replacing_folder, write_bytes
+from gridworld.base.errors import InputError, install_command
 from gridworld.envs.rendering import Frame
-from gridworld.errors import InputError, install_command
-from gridworld.storage.atomic_write import replacing, replacing_folder, write_bytes
 from gridworld.visualization.animation import Animation
 
 FORMATS = ("png", "gif", "apng", "mp4")

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
+from gridworld.base.serialization import State
 from gridworld.config.train import TrainConfig
 from gridworld.envs.rendering import Frame
-from gridworld.storage.serialization import State
 from gridworld.visualization.animation import Animation
 from gridworld.world.evaluation import Evaluator
 

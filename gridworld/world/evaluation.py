@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.process.console import telling_if_slow
+from gridworld.base.console import telling_if_slow
 from gridworld.world.chain import Chain, Outcome, one_hot_policy
 from gridworld.world.mdp import FloatArray, Mdp
 from gridworld.world.solver import Solution, solved

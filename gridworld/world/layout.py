@@ -24,8 +24,8 @@ from importlib.resources import files
 from os import PathLike, fspath
 from typing import Any
 
-from gridworld.errors import InputError
-from gridworld.process.user_input import open_users_file
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import open_users_file
 
 Cell = tuple[int, int]  # (row, column), both from 0, the top-left cell first
 

@@ -20,8 +20,8 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.bounds import Bounds
-from gridworld.errors import InputError
+from gridworld.base.bounds import Bounds
+from gridworld.base.errors import InputError
 
 IntArray = NDArray[np.integer[Any]]
 FloatArray = NDArray[np.float64]

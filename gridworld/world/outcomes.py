@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.errors import InputError
-from gridworld.process.user_input import check_memory
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import check_memory
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import (
     LEAST_REWARD,

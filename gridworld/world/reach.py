@@ -24,7 +24,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from gridworld.errors import InputError, in_short
+from gridworld.base.errors import InputError, in_short
 from gridworld.world.reading import (
     OF_A_CLASS,
     PLAIN,

@@ -28,7 +28,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 from gridworld.world.chain import (
     DENSE_STATES,
     ORDINARY_GAMMA,

@@ -28,7 +28,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from gridworld.errors import InputError, in_short
+from gridworld.base.errors import InputError, in_short
 from gridworld.world.mdp import Mdp, checked_reward, frozen
 from gridworld.world.outcomes import absorbing_states, thresholds_of
 from gridworld.world.reach import SO_UNKNOWN, Reach, asked, same

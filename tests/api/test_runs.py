@@ -246,7 +246,7 @@ def test_a_program_that_uses_hydra_keeps_its_own() -> None:
 def test_progress_is_shown_or_not(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gridworld.process.console._SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr("gridworld.base.console._SECONDS_BETWEEN_LINES", 0.0)
     gridworld.train(*SHORT["q_learning"], progress=False)
     assert capsys.readouterr().err == ""
     gridworld.train(*SHORT["q_learning"])

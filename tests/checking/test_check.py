@@ -13,12 +13,12 @@ from stable_baselines3 import A2C, DQN, PPO
 
 import gridworld
 from gridworld.agents import PolicySnapshot
+from gridworld.base.errors import InputError
 from gridworld.checking import probes as expect
 from gridworld.checking import run
 from gridworld.checking.probes import PROBES, Trained
 from gridworld.checking.training import arguments, settings, subject, train
 from gridworld.commands import check as command
-from gridworld.errors import InputError
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.mdp import Mdp
 from gridworld.world.solver import solved

@@ -14,9 +14,9 @@ import pytest
 from helpers.support import NO_FILES, ROOT, SHORT, configure, train_in
 from hydra.errors import HydraException
 
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import sealed
 from gridworld.config.words import sentence
-from gridworld.errors import InputError
-from gridworld.storage.safe_read import sealed
 from gridworld.training.train import train
 
 YAMLS: dict[str, bytes] = {

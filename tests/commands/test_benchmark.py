@@ -11,8 +11,8 @@ from helpers.support import ROOT
 from omegaconf import OmegaConf
 
 import gridworld
+from gridworld.base.errors import InputError
 from gridworld.commands import benchmark
-from gridworld.errors import InputError
 
 sys.path.append(str(ROOT / "docs"))
 measure, training, worlds, population, peers, whole = (

@@ -12,10 +12,10 @@ from typing import IO, Any
 import pytest
 from helpers.support import CONF, ROOT, SHORT, start
 
+from gridworld.base.errors import InputError
 from gridworld.commands import evaluate, run
 from gridworld.commands import record as record_command
 from gridworld.commands.manual import manual
-from gridworld.errors import InputError
 
 TRAINED_WITHOUT_NEEDLESS_IMPORTS = f"""
 import runpy, sys

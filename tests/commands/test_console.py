@@ -13,11 +13,11 @@ import pytest
 from helpers.support import CONF, ROOT, SHORT
 
 from gridworld import __version__
+from gridworld.base import console
+from gridworld.base.errors import DISTRIBUTION
 from gridworld.commands import COMMANDS
 from gridworld.commands import console as main
 from gridworld.config.words import conf_folder
-from gridworld.errors import DISTRIBUTION
-from gridworld.process import console
 from gridworld.run.provenance import code
 
 TEXTS = (".py", ".md", ".yaml", ".toml", ".cff", ".j2")
@@ -118,7 +118,7 @@ def test_the_wheel_holds_what_it_takes_to_train(wheel: Path) -> None:
         for suffix in ("py", "txt", "j2", "yml", "typed")
         for path in package.rglob(f"*.{suffix}")
     }
-    assert ours - names == {"gridworld/sweep/hydra_plugin.py"}  # where Hydra looks for it:
+    assert ours - names == {"gridworld/sweeps/hydra_plugin.py"}  # where Hydra looks for it:
     assert "hydra_plugins/gridworld_sweeper.py" in names
     assert {name.split("/")[0] for name in names} == {
         "gridworld",

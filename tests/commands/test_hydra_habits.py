@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from helpers.support import ROOT, script
 
+from gridworld.base.errors import InputError
 from gridworld.commands.tune import main as tune
-from gridworld.errors import InputError
 
 
 def test_a_job_in_its_own_folder_speaks_of_the_users(tmp_path: Path) -> None:

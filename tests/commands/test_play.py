@@ -8,11 +8,11 @@ import pygame
 import pytest
 from helpers.support import SHORT, train_in
 
+from gridworld.base.errors import InputError
 from gridworld.commands import play as command
 from gridworld.commands.play import Game, Player, draw
 from gridworld.config.worlds import EnumeratedConfig, GymnasiumConfig
 from gridworld.envs.rendering import AGENT, draw_frame
-from gridworld.errors import InputError
 from gridworld.visualization.episode import RealEnv
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp

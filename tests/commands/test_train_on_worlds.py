@@ -9,7 +9,7 @@ import pytest
 from helpers.support import script
 from PIL import Image
 
-from gridworld.restore.saved_run import SavedRun
+from gridworld.training.saved_run import SavedRun
 from gridworld.world.sources.gymnasium_table import compile_gymnasium
 
 TRAINED = (

@@ -10,11 +10,11 @@ import pytest
 import stable_baselines3
 from helpers.support import CONF, DEEP, configure
 
+from gridworld.base.errors import InputError
 from gridworld.config.settings import agent_schemas, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import SOURCES
 from gridworld.envs.observations import make_observation
-from gridworld.errors import InputError
 from gridworld.world.layout import shipped_layouts
 
 ELSEWHERE = {"tune", "tuned", "experiment"}  # for recipes and studies see test_recipes.py

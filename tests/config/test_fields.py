@@ -9,7 +9,8 @@ from typing import Any, get_args, get_origin
 import pytest
 from helpers.support import CONF, NO_FILES, configure, train_in
 
-from gridworld.bounds import Bounds
+from gridworld.base.bounds import Bounds
+from gridworld.base.errors import InputError
 from gridworld.commands.report import main as report
 from gridworld.config.fields import BOUNDS, RATE, Text, declared
 from gridworld.config.recipe_file import with_recipe
@@ -17,7 +18,6 @@ from gridworld.config.settings import agent_schemas, foreign, privileges, settin
 from gridworld.config.sweep import TuneConfig
 from gridworld.config.train import TrainConfig, check_bounds
 from gridworld.config.worlds import SOURCES
-from gridworld.errors import InputError
 from gridworld.run.summary import summary_text
 
 SECTIONS = (TrainConfig, TuneConfig, *agent_schemas().values(), *SOURCES.values())

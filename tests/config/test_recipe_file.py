@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 from helpers.support import CONF, configure, script
 
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import read_object
 from gridworld.config.compose import compose_run, register_schemas, search_path
 from gridworld.config.recipe_file import harmless_words, overrides, with_recipe
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import BuiltConfig
-from gridworld.errors import InputError
-from gridworld.storage.safe_read import read_object
-from gridworld.tune.study import write_recipe
-from gridworld.tune.study_spec import compose_study
+from gridworld.sweeps.tune.study import write_recipe
+from gridworld.sweeps.tune.study_spec import compose_study
 
 WINNERS = {
     "dqn": [

@@ -8,17 +8,17 @@ from typing import Any
 
 import pytest
 
+from gridworld.base.errors import InputError
 from gridworld.config.fields import Effect
 from gridworld.config.settings import agent_schemas, effect_of, flat
 from gridworld.config.sweep import DimensionConfig
 from gridworld.config.train import TrainConfig
-from gridworld.errors import InputError
 from gridworld.report.evidence import Evidence
 from gridworld.report.grouping import learning_key, task_key
 from gridworld.run.provenance import identity, settings_hash
+from gridworld.sweeps.tune.study import _relevant
+from gridworld.sweeps.tune.study_spec import SearchSpace
 from gridworld.training.tensorboard import hparams
-from gridworld.tune.study import _relevant
-from gridworld.tune.study_spec import SearchSpace
 
 DECLARED = {
     Effect.LENGTH: {"total_timesteps"},

@@ -8,8 +8,8 @@ from helpers.support import configure
 from hydra.errors import HydraException
 
 import gridworld
+from gridworld.base.errors import InputError
 from gridworld.config.words import prepared, refuse_unclear, sentence
-from gridworld.errors import InputError
 
 
 @pytest.mark.parametrize(

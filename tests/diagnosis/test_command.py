@@ -14,7 +14,7 @@ import gridworld
 from gridworld.commands import diagnose
 from gridworld.diagnosis.causes import learning
 from gridworld.diagnosis.verdict import draw_diagnosis
-from gridworld.restore.saved_run import SavedRun
+from gridworld.training.saved_run import SavedRun
 
 _SPOILT = ["agent=q_learning", "agent.learning_rate=0.001", "total_timesteps=2000", "seed=0"]
 

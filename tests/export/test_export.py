@@ -18,10 +18,10 @@ from helpers.pages import blocks
 from helpers.support import NO_FILES, SHORT, script, train_in
 from PIL import Image
 
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import sealed
 from gridworld.commands import export
-from gridworld.errors import InputError
 from gridworld.export.exported_run import read
-from gridworld.storage.safe_read import sealed
 
 NAME, TABLE = "dqn-classic-seed0", "q_learning-classic-seed3"
 

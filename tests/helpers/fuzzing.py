@@ -19,17 +19,17 @@ from helpers.support import SHORT, configure
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import sealed
 from gridworld.commands import jobs as jobs_command
 from gridworld.config.compose import to_config
-from gridworld.errors import InputError
 from gridworld.report.evidence import read
 from gridworld.report.setting_charts import tuning_charts
 from gridworld.report.tables import to_captioned_markdown, to_csv, tuning_tables
 from gridworld.report.tuning_study import TRIALS_SUM, find_tunings
-from gridworld.restore.saved_run import SavedRun
-from gridworld.storage.safe_read import sealed
+from gridworld.sweeps.tune.study import is_claimed
+from gridworld.training.saved_run import SavedRun
 from gridworld.training.setup import check_settings, make_context
-from gridworld.tune.study import is_claimed
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load

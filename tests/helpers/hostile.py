@@ -28,11 +28,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from gridworld.base.safe_read import sealed
+from gridworld.base.serialization import decode, encode
+from gridworld.base.user_input import npz_bytes
 from gridworld.config.settings import read_config
-from gridworld.process.user_input import npz_bytes
 from gridworld.run.provenance import identity
-from gridworld.storage.safe_read import sealed
-from gridworld.storage.serialization import decode, encode
 from gridworld.training.tensorboard import _checksum
 
 SECRET = "the-secret-7f3a"

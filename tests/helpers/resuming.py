@@ -15,10 +15,10 @@ from helpers.support import configure
 from helpers.support import train_in as begin
 from tensorboard.compat.proto.event_pb2 import Event
 
-from gridworld.restore.resume import open_unfinished, unfinished_of
+from gridworld.base.serialization import decode
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.reader import is_started
-from gridworld.storage.serialization import decode
+from gridworld.training.resume import open_unfinished, unfinished_of
 from gridworld.training.together import run_together
 from gridworld.training.train import training
 

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from helpers.support import configure
 
+from gridworld.base.safe_read import sealed, sha256
 from gridworld.config.train import TrainConfig
 from gridworld.report import tuning_study as tuning
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import read_run
-from gridworld.storage.safe_read import sealed, sha256
-from gridworld.sweep.folder import SweepFolder
-from gridworld.sweep.plan import Job
-from gridworld.tune.study import SEARCH_JSON
+from gridworld.sweeps.folder import SweepFolder
+from gridworld.sweeps.plan import Job
+from gridworld.sweeps.tune.study import SEARCH_JSON
 from gridworld.world.evaluation import Evaluator
 
 _COLUMNS = ("value", "regret", "certified", "goal_probability", "trap_probability", "timeout_probability")

@@ -23,7 +23,7 @@ from omegaconf import DictConfig
 from gridworld.config.compose import register_schemas
 from gridworld.config.presets import with_preset
 from gridworld.config.train import TrainConfig
-from gridworld.sweep.plan import Configurations
+from gridworld.sweeps.plan import Configurations
 from gridworld.training.train import train
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -39,11 +39,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 import gridworld
+from gridworld.base import console
 from gridworld.config.compose import compose
 from gridworld.envs.rendering import import_pygame
-from gridworld.process import console
 from gridworld.report import writer
-from gridworld.tune import search as tune_search
+from gridworld.sweeps.tune import search as tune_search
 
 _CONF = Path(__file__).resolve().parents[2] / "conf"
 _PATH: list[str] = json.loads(  # of a new process, without the folder of its program and PYTHONPATH
@@ -90,7 +90,7 @@ def _prepare() -> None:
     PIL.Image.init()  # its file formats
     console._SECONDS_BETWEEN_LINES = 600.0
     tune_search._SECONDS_BETWEEN_TABLES = 0.3
-    if launcher := sys.modules.get("gridworld.sweep.launchers.slurm"):  # it runs here: files are not late
+    if launcher := sys.modules.get("gridworld.sweeps.launchers.slurm"):  # it runs here: files are not late
         vars(launcher).update(_SECONDS_BETWEEN_QUESTIONS=1.0, _FILES_ARRIVE_WITHIN=1.0)
     compose_quickly()
     compose([])

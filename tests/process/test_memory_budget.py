@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from helpers.support import SHORT, train_in
 
+from gridworld.base import console
+from gridworld.base.console import telling_if_slow
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import as_object, as_table
+from gridworld.base.serialization import decode, encode
+from gridworld.base.user_input import VARIABLE, BudgetError, check_memory, is_limited, limited
 from gridworld.commands import evaluate
-from gridworld.errors import InputError
-from gridworld.process import console
-from gridworld.process.console import telling_if_slow
-from gridworld.process.user_input import VARIABLE, BudgetError, check_memory, is_limited, limited
-from gridworld.storage.safe_read import as_object, as_table
-from gridworld.storage.serialization import decode, encode
 
 
 def test_the_sentence_says_what_it_would_take_the_budget_and_how_to_raise_it(

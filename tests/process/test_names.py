@@ -12,16 +12,16 @@ import pytest
 from helpers.hostile import manifest
 from helpers.support import SHORT, train_in
 
+from gridworld.base.console import prepare
+from gridworld.base.safe_read import sealed
 from gridworld.commands import evaluate, jobs, report, reproduce, run
 from gridworld.commands import train as train_command
 from gridworld.config.train import TrainConfig
-from gridworld.process.console import prepare
 from gridworld.report.tables import Table, to_captioned_markdown, to_csv, to_markdown
 from gridworld.report.tuning_study import find_tunings
-from gridworld.storage.safe_read import sealed
-from gridworld.sweep import console
-from gridworld.sweep.folder import FAILED, JobRow, SweepFolder
-from gridworld.sweep.plan import Job
+from gridworld.sweeps import console
+from gridworld.sweeps.folder import FAILED, JobRow, SweepFolder
+from gridworld.sweeps.plan import Job
 
 EVIL = "x\x1b[2J\x1b]0;owned\x07\n\r\u202e<b onclick=x>|[a](javascript:x)\udcff"
 SHOWN = r"x\x1b[2J\x1b]0;owned\x07\n\r\u202e"

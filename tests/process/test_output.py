@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from helpers.support import ROOT, SHORT, script, train_in
 
-from gridworld.process import console
-from gridworld.storage.safe_read import sealed
+from gridworld.base import console
+from gridworld.base.safe_read import sealed
 
 NO_UTF8 = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 ASCII = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"}

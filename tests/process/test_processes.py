@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from gridworld.process.processes import LostError, Processes
-from gridworld.process.signals import Interrupted, StopRequest
+from gridworld.base.processes import LostError, Processes
+from gridworld.base.signals import Interrupted, StopRequest
 
 
 def run(tasks: Sequence[Callable[[], Any]], count: int = 2, forks: bool = True) -> list[Any]:

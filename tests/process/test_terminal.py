@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gridworld.base.console import aligned, printable
+from gridworld.base.safe_read import sealed
 from gridworld.commands import jobs as jobs_command
-from gridworld.process.console import aligned, printable
 from gridworld.run.summary import summary_text
-from gridworld.storage.safe_read import sealed
-from gridworld.sweep import folder
-from gridworld.sweep.folder import JobRow
+from gridworld.sweeps import folder
+from gridworld.sweeps.folder import JobRow
 
 WORDS = st.text("ab-.0", min_size=1, max_size=30)
 USUAL = {

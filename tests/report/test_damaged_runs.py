@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 from helpers.support import SHORT, train_in
 
+from gridworld.base.errors import InputError
 from gridworld.commands import report as command
-from gridworld.errors import InputError
 from gridworld.report.analysis import gather
 from gridworld.report.evidence import Evidence, Unusable, read
 from gridworld.report.writer import write_over_seeds
 from gridworld.run.folder import RESULTS, WORLD
 from gridworld.run.reader import read_run
-from gridworld.sweep.console import results_lines
-from gridworld.sweep.folder import DONE, JobRow
+from gridworld.sweeps.console import results_lines
+from gridworld.sweeps.folder import DONE, JobRow
 
 AGENTS = ("sarsa", "q_learning")
 SEEDS = range(2)

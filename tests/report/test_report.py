@@ -23,10 +23,11 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar import layout_pb2
 
+from gridworld.base.console import plain
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import sealed
 from gridworld.commands import report as command
 from gridworld.config.train import PICTURES
-from gridworld.errors import InputError
-from gridworld.process.console import plain
 from gridworld.report import tables
 from gridworld.report.agent_charts import overall_charts, task_charts
 from gridworld.report.analysis import Overall, Reason, Report, TaskAnalysis, gather, on_grid, online_return
@@ -37,7 +38,6 @@ from gridworld.report.setting_charts import sweep_charts, sweeps
 from gridworld.report.statistics import Interval
 from gridworld.report.tuning_study import find_tunings
 from gridworld.report.writer import BANDS, MARKERS, charts, render
-from gridworld.storage.safe_read import sealed
 from gridworld.world.evaluation import Evaluator
 
 FORMATS = ("png", "pdf", "svg")  # more words of `--formats`

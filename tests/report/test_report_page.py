@@ -9,8 +9,8 @@ from helpers.runs_folder import Maker, sweep
 from helpers.support import SHORT, train_in
 from PIL import Image
 
+from gridworld.base.safe_read import sealed
 from gridworld.commands import report as command
-from gridworld.storage.safe_read import sealed
 
 SIZES = {"phone": (390, 844), "desktop": (1280, 900)}
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from helpers.support import NO_FILES, ROOT, script, train_in
 
-from gridworld.restore.advice import _still_falls, advice
 from gridworld.run.reader import RunReader
 from gridworld.run.summary import circles_text
+from gridworld.training.advice import _still_falls, advice
 
 SHORT = ["total_timesteps=200", "evaluation.every=20", *NO_FILES]
 

@@ -22,21 +22,21 @@ from helpers.resuming import go_on, stopped_after
 from helpers.runs_folder import Maker, write_study, write_sweep
 from helpers.support import SHORT, train_in
 
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import sealed
+from gridworld.base.serialization import decode, encode
 from gridworld.commands import jobs as jobs_command
 from gridworld.config.train import PICTURES
-from gridworld.errors import InputError
 from gridworld.report import tuning_study as tuning
 from gridworld.report.analysis import gather
 from gridworld.report.writer import charts, render
-from gridworld.restore.reproduce import check_whole
-from gridworld.restore.resume import open_unfinished
-from gridworld.restore.saved_run import SavedRun, read_visits
 from gridworld.run.reader import read_run
-from gridworld.storage.safe_read import sealed
-from gridworld.storage.serialization import decode, encode
-from gridworld.sweep.folder import SweepFolder
-from gridworld.tune.confirmation import certified_since
-from gridworld.tune.study import is_claimed
+from gridworld.sweeps.folder import SweepFolder
+from gridworld.sweeps.tune.confirmation import certified_since
+from gridworld.sweeps.tune.study import is_claimed
+from gridworld.training.reproduce import check_whole
+from gridworld.training.resume import open_unfinished
+from gridworld.training.saved_run import SavedRun, read_visits
 
 Telling = Callable[[Path], str]  # all that a command makes of a folder; raises `InputError`
 

@@ -14,9 +14,9 @@ from helpers.own_class import OWN_CLASS, any_class
 from helpers.resuming import go_on, stopped_after
 from helpers.support import ROOT, SHORT, script, train_in
 
+from gridworld.base.errors import InputError
 from gridworld.commands import reproduce as command
 from gridworld.commands.reproduce import main
-from gridworld.errors import InputError
 from gridworld.run.folder import SOURCE_DIFF
 from gridworld.run.provenance import describe, differences, source_of
 from gridworld.training.tensorboard import EventWriter, read_scalars

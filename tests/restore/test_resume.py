@@ -27,10 +27,10 @@ from helpers.resuming import (
 )
 from helpers.support import SHORT
 
+from gridworld.base import atomic_write as files
+from gridworld.base.atomic_write import AppendLog
 from gridworld.run import checkpoints as checkpoint
 from gridworld.run.checkpoints import Checkpoints
-from gridworld.storage import atomic_write as files
-from gridworld.storage.atomic_write import AppendLog
 from gridworld.training import session
 from gridworld.training.pictures import Pictures
 

@@ -14,15 +14,15 @@ import pytest
 from helpers.resuming import begin, differences, go_on, left_behind, stopped_after
 from helpers.support import ROOT, SHORT, script, start, wait_for
 
+from gridworld.base.atomic_write import AppendLog, locked
+from gridworld.base.errors import InputError
+from gridworld.base.serialization import decode, encode
 from gridworld.commands.train import resume
-from gridworld.errors import InputError
-from gridworld.restore.resume import open_unfinished
 from gridworld.run import provenance
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.folder import LOCK, RunFolder
 from gridworld.run.provenance import Source
-from gridworld.storage.atomic_write import AppendLog, locked
-from gridworld.storage.serialization import decode, encode
+from gridworld.training.resume import open_unfinished
 
 LESS = ["recording.frames=false", "recording.gif=false"]
 WORDS = [*SHORT["q_learning"], *LESS, "checkpoint.every=600"]
@@ -302,7 +302,7 @@ def test_a_signal_saves_and_ends_soon(
 STOPPED_EARLY = """
 import os, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it
-from gridworld.process.signals import at_work, listen
+from gridworld.base.signals import at_work, listen
 listen()
 if sys.argv[1] == "before":
     os.kill(os.getpid(), int(sys.argv[2]))
@@ -336,7 +336,7 @@ def test_a_signal_that_comes_early_or_late(when: str, number: signal.Signals) ->
 def test_scripts_listen_before_what_takes_time_to_import() -> None:
     for path in (ROOT / "scripts").glob("*.py"):
         code = [line for line in path.read_text().splitlines()[1:] if line]
-        assert code[0] == "from gridworld.process.signals import listen"
+        assert code[0] == "from gridworld.base.signals import listen"
         assert code[2] == "    listen()  # before what takes time to import"
 
 

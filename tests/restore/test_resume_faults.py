@@ -14,12 +14,12 @@ from helpers.hostile import damaged
 from helpers.resuming import at_call, begin, differences, go_on, left_behind, stopped_after
 from helpers.support import ROOT, SHORT, script, train_on_full_disk
 
+from gridworld.base.atomic_write import AppendLog
+from gridworld.base.errors import InputError
 from gridworld.engine.dqn import DQN
-from gridworld.errors import InputError
 from gridworld.run import checkpoints as checkpoint
 from gridworld.run import writer as run
 from gridworld.run.checkpoints import Checkpoints
-from gridworld.storage.atomic_write import AppendLog
 
 DAMAGES = int(os.environ.get("GRIDWORLD_DAMAGES", "8"))
 LESS = ["recording.frames=false", "recording.gif=false"]

@@ -17,11 +17,11 @@ from helpers.hostile import damaged
 from helpers.resuming import begin, differences, go_on, last_state, left_behind, stopped_after
 from helpers.support import SHORT, configure
 
-from gridworld.errors import InputError
-from gridworld.restore.resume import _why_not
+from gridworld.base.errors import InputError
+from gridworld.base.serialization import State, StateError, decode, encode
 from gridworld.run.checkpoints import Checkpoints, Pace
 from gridworld.run.provenance import identity
-from gridworld.storage.serialization import State, StateError, decode, encode
+from gridworld.training.resume import _why_not
 
 CORRUPTIONS = int(os.environ.get("GRIDWORLD_CORRUPTIONS", "200"))
 LESS = [*("recording.frames=false", "recording.gif=false", "env.slip=0.1", "logging.policy_map_every=0")]

@@ -15,15 +15,15 @@ from helpers.support import NO_FILES, SHORT, configure, script
 from stable_baselines3 import DQN
 
 from gridworld.agents.sb3.model_file import read_weights
+from gridworld.base.errors import InputError
+from gridworld.base.signals import Interrupted
 from gridworld.commands import evaluate, play, record
 from gridworld.envs.observations import make_observation
-from gridworld.errors import InputError
-from gridworld.process.signals import Interrupted
-from gridworld.restore.reproduce import compare
-from gridworld.restore.saved_run import SavedRun
 from gridworld.run.reader import open_run
 from gridworld.training import session
 from gridworld.training.learning_curve import LearningCurve
+from gridworld.training.reproduce import compare
+from gridworld.training.saved_run import SavedRun
 
 # It is optimal on the way and no more at the end, at which it explores still.
 FORGETFUL = ["agent=q_learning", "total_timesteps=3000", "n_envs=1", "evaluation.every=250", "env.slip=0.2"]

@@ -9,12 +9,12 @@ import pytest
 from helpers.resuming import begin
 from helpers.support import SHORT, configure, script, start, wait_for
 
-from gridworld.errors import FolderLostError
+from gridworld.base.errors import FolderLostError
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.folder import alone_in
 from gridworld.run.reader import open_run
-from gridworld.sweep.folder import SweepFolder
-from gridworld.sweep.job import JobError, run_in_sweep
+from gridworld.sweeps.folder import SweepFolder
+from gridworld.sweeps.job import JobError, run_in_sweep
 from gridworld.training.pictures import Pictures
 from gridworld.training.together import run_alone
 

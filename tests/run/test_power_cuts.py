@@ -14,11 +14,11 @@ from helpers.disk import Disk, Left, put_back
 from helpers.resuming import begin, begin_or_go_on, differences, go_on, left_behind, stopped_after
 from helpers.support import SHORT, configure
 
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 from gridworld.run.reader import read_run
-from gridworld.sweep.folder import DONE, FAILED, SweepFolder
-from gridworld.sweep.job import run_in_sweep
-from gridworld.sweep.plan import plan
+from gridworld.sweeps.folder import DONE, FAILED, SweepFolder
+from gridworld.sweeps.job import run_in_sweep
+from gridworld.sweeps.plan import plan
 from gridworld.training.together import run_alone
 
 CUTS = int(os.environ.get("GRIDWORLD_POWER_CUTS", "6"))

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gridworld.process.console import plain
+from gridworld.base.console import plain
+from gridworld.base.safe_read import csv_rows, csv_text
 from gridworld.report.tables import Table, to_csv
-from gridworld.storage.safe_read import csv_rows, csv_text
-from gridworld.sweep.folder import JobRow, SweepFolder
+from gridworld.sweeps.folder import JobRow, SweepFolder
 
 FORMULA = re.compile(r"[=+\-@\t\r\n]")
 TEXTS = st.text(st.sampled_from("=+-@\t\r\n',;\"a1. "), max_size=6)

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from gridworld.storage.atomic_write import tidy
+from gridworld.base.atomic_write import tidy
 
 _WRITES = """
 import os, sys
 from pathlib import Path
-from gridworld.storage.atomic_write import replacing, replacing_folder
+from gridworld.base.atomic_write import replacing, replacing_folder
 end, name = sys.argv[1:]
 with (replacing if "." in name else replacing_folder)(Path(name)) as part:
     (part if "." in name else part / "events").write_text("half")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.resuming import differences
 
-from gridworld.storage.serialization import decode, encode
+from gridworld.base.serialization import decode, encode
 
 
 def test_a_packed_state_comes_back() -> None:

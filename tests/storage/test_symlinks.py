@@ -5,15 +5,15 @@ from pathlib import Path
 import pytest
 from helpers.support import SHORT, configure, script
 
+from gridworld.base.atomic_write import check_no_links, inside, is_locked
+from gridworld.base.errors import InputError
 from gridworld.config.train import TrainConfig
-from gridworld.errors import InputError
 from gridworld.run.folder import alone_in
 from gridworld.run.reader import check_free
-from gridworld.storage.atomic_write import check_no_links, inside, is_locked
-from gridworld.sweep.folder import SweepFolder
-from gridworld.sweep.plan import Job
-from gridworld.tune import confirmation as confirm
-from gridworld.tune.study import check_study_folder
+from gridworld.sweeps.folder import SweepFolder
+from gridworld.sweeps.plan import Job
+from gridworld.sweeps.tune import confirmation as confirm
+from gridworld.sweeps.tune.study import check_study_folder
 
 REFUSED = "is a symbolic link, which is not written through; remove it"
 

@@ -14,12 +14,12 @@ import pytest
 from helpers.pages import NO_PICTURES
 from helpers.support import ROOT, script, start, train_on_full_disk, wait_for
 
+from gridworld.base.atomic_write import is_locked, locked
 from gridworld.commands import jobs as jobs_command
 from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
-from gridworld.storage.atomic_write import is_locked, locked
-from gridworld.sweep.console import results_lines
-from gridworld.sweep.folder import SweepFolder
+from gridworld.sweeps.console import results_lines
+from gridworld.sweeps.folder import SweepFolder
 
 QUICK = ("agent=q_learning", "total_timesteps=500", *NO_PICTURES)
 FOLDER = "hydra.sweep.dir=sweep"

@@ -15,8 +15,8 @@ from helpers.resuming import differences, left_behind
 from helpers.support import script, start
 from helpers.sweeps import rows
 
+from gridworld.base.atomic_write import is_locked
 from gridworld.commands import jobs as jobs_command
-from gridworld.storage.atomic_write import is_locked
 
 KILLS = int(os.environ.get("GRIDWORLD_KILLS", "4"))
 EVERY = 256  # steps: checkpoints

@@ -20,11 +20,11 @@ from helpers.resuming import differences, go_on, left_behind, stopped_after
 from helpers.stand_in_cuda import stand_in
 from helpers.support import ROOT, configure, script
 
+from gridworld.base.errors import InputError
+from gridworld.base.together import mixing
 from gridworld.commands import reproduce as command
-from gridworld.errors import InputError
-from gridworld.process.together import mixing
-from gridworld.restore.reproduce import population
 from gridworld.run.reader import read_run
+from gridworld.training.reproduce import population
 from gridworld.training.setup import check_settings, make_context
 
 SMALL = (

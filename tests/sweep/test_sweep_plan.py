@@ -16,16 +16,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import DictConfig
 
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import read_object
 from gridworld.config.compose import register_schemas, to_config
 from gridworld.config.train import TrainConfig
-from gridworld.errors import InputError
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
-from gridworld.storage.safe_read import read_object
-from gridworld.sweep import plan as sweep_plan
-from gridworld.sweep.folder import folder_name
-from gridworld.sweep.plan import Configurations, Job, expand, largest_population, plan, populations
+from gridworld.sweeps import plan as sweep_plan
+from gridworld.sweeps.folder import folder_name
+from gridworld.sweeps.plan import Configurations, Job, expand, largest_population, plan, populations
 from gridworld.training.setup import check_settings
 
 

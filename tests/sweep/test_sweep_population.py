@@ -16,11 +16,11 @@ from helpers.support import ROOT, script, start, wait_for
 from helpers.sweeps import differing, logged, rows
 from test_sweep import WORKERS
 
-from gridworld.errors import InputError
+from gridworld.base.atomic_write import AppendLog
+from gridworld.base.errors import InputError
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.folder import claimed
-from gridworld.storage.atomic_write import AppendLog
-from gridworld.sweep import plan as plan_module
+from gridworld.sweeps import plan as plan_module
 from gridworld.training.learning_curve import LearningCurve
 
 SMALL = (
@@ -193,7 +193,7 @@ def test_a_run_has_as_many_files_open_as_a_population_reckons_with(
 _WITH_FEW_FILES = """
 import os, resource, runpy, sys
 del sys.argv[0]
-from gridworld.sweep import plan as plan_module
+from gridworld.sweeps import plan as plan_module
 plan_module.file_limit = lambda: sys.maxsize
 resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 18, 10**4))
 runpy.run_path(sys.argv[0], run_name="__main__")

@@ -43,5 +43,5 @@ def test_a_run_that_was_never_interrupted_calls_few_files_and_none_of_resuming(t
     assert done.returncode == 0, done.stderr
     files = done.stdout.splitlines()[-1].split()[1:]
     assert "training/session.py" in files
-    assert not [path for path in files if path.startswith("restore/resume")]
+    assert not [path for path in files if path.startswith("training/resume")]
     assert len(files) <= MOST, "\n".join(files)

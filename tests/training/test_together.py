@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from gridworld.agents import Learning
-from gridworld.process.signals import Interrupted
-from gridworld.process.together import clock
+from gridworld.base.signals import Interrupted
+from gridworld.base.together import clock
 from gridworld.training.together import Training, run_alone, run_together
 
 NAME: ContextVar[str] = ContextVar("name", default="outside")

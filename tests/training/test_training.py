@@ -17,11 +17,11 @@ from helpers.support import NO_FILES, SHORT, configure, train_in
 from PIL import Image
 
 from gridworld.agents import Agent, PolicySnapshot
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import sealed
 from gridworld.envs.statistics_env import Returns
-from gridworld.errors import InputError
-from gridworld.restore.saved_run import SavedRun
-from gridworld.storage.safe_read import sealed
 from gridworld.training.learning_curve import LearningCurve
+from gridworld.training.saved_run import SavedRun
 from gridworld.training.together import run_together
 from gridworld.training.train import train, training
 from gridworld.world.chain import one_hot_policy

@@ -18,12 +18,12 @@ from helpers import forks
 from helpers.support import ROOT, script, start, wait_for
 from optuna.trial import TrialState, create_trial
 
+from gridworld.base.errors import InputError
 from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
-from gridworld.errors import InputError
 from gridworld.run.folder import claimed
-from gridworld.tune import study as tune_study
-from gridworld.tune import study_spec
+from gridworld.sweeps.tune import study as tune_study
+from gridworld.sweeps.tune import study_spec
 
 QUICK = (
     *("agent=q_learning", "total_timesteps=1500", "recording.gif=false", "recording.learning=false"),

@@ -26,14 +26,12 @@ from hypothesis import strategies as st
 from optuna.trial import FrozenTrial, TrialState, create_trial
 from test_tune import refused
 
+from gridworld.base.errors import InputError
+from gridworld.base.processes import LostError, Processes
+from gridworld.base.safe_read import sealed
 from gridworld.config.sweep import DimensionConfig
-from gridworld.errors import InputError
-from gridworld.process.processes import LostError, Processes
-from gridworld.storage.safe_read import sealed
-from gridworld.training.setup import check_settings
-from gridworld.training.together import run_alone
-from gridworld.tune import objective as objective_module
-from gridworld.tune.confirmation import (
+from gridworld.sweeps.tune import objective as objective_module
+from gridworld.sweeps.tune.confirmation import (
     HeldOutResults,
     choose_finalists,
     held_out_runs,
@@ -41,7 +39,7 @@ from gridworld.tune.confirmation import (
     read_results,
     verdict_on,
 )
-from gridworld.tune.objective import (
+from gridworld.sweeps.tune.objective import (
     Objective,
     Outcome,
     Report,
@@ -51,8 +49,10 @@ from gridworld.tune.objective import (
     score,
     with_values,
 )
-from gridworld.tune.search import open_study, search
-from gridworld.tune.study_spec import SearchSpace, StudySpec, compose_study
+from gridworld.sweeps.tune.search import open_study, search
+from gridworld.sweeps.tune.study_spec import SearchSpace, StudySpec, compose_study
+from gridworld.training.setup import check_settings
+from gridworld.training.together import run_alone
 
 SPACES = sorted(
     file.stem

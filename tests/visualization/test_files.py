@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gridworld.base.atomic_write import replacing, replacing_folder, write_json
+from gridworld.base.errors import InputError, failure
 from gridworld.envs.rendering import draw_frame, pack
-from gridworld.errors import InputError, failure
-from gridworld.storage.atomic_write import replacing, replacing_folder, write_json
 from gridworld.visualization import files
 from gridworld.visualization.animation import animation_of_frames, animation_of_states, automatic_cell_size
 from gridworld.world.grid import compile_mdp

@@ -7,9 +7,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from gridworld.base.errors import InputError
 from gridworld.config.worlds import GymnasiumConfig
 from gridworld.envs.rendering import board_of
-from gridworld.errors import InputError
 from gridworld.visualization.episode import rendered_frames
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources.enumerated import enumerate_env

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from scipy.stats import binom, chi2_contingency
 
 import gridworld
+from gridworld.base.workarounds import blas_threads
 from gridworld.envs import rollout
 from gridworld.envs.rollout import play, sample_episodes
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.training.setup import check_settings, make_context, objective_note
-from gridworld.workarounds import blas_threads
 from gridworld.world.chain import Chain, one_hot_policy
 from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.grid import compile_mdp

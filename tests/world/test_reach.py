@@ -26,7 +26,7 @@ import pytest
 import torch
 from stable_baselines3.common.utils import ConstantSchedule, constant_fn
 
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 from gridworld.world.reach import asked
 from gridworld.world.reading import UnreadableError, digest
 

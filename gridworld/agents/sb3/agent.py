@@ -34,13 +34,13 @@ from gridworld.agents.sb3.policy_outputs import explored, read_table, why_no_tab
 from gridworld.agents.sb3.replay_counts import ReplayCounts
 from gridworld.agents.sb3.settings import SB3Config
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.bounds import Bounds
+from gridworld.base.bounds import Bounds
+from gridworld.base.console import tell
+from gridworld.base.errors import InputError
+from gridworld.base.serialization import State, StateError
 from gridworld.engine.optimizer import ELEMENTWISE
 from gridworld.engine.population import Population, train
 from gridworld.engine.sb3_format import algorithm_of, make_run, model_file, put_weights
-from gridworld.errors import InputError
-from gridworld.process.console import tell
-from gridworld.storage.serialization import State, StateError
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.mdp import FloatArray
 

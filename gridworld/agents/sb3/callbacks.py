@@ -28,10 +28,8 @@ from stable_baselines3.common.utils import FloatSchedule
 from gridworld.agents import Hook, SafePoint
 from gridworld.agents.sb3.model_file import load_tensors
 from gridworld.agents.sb3.settings import SCHEDULES
-from gridworld.config.fields import Decay
-from gridworld.engine.population import diverged, log_state, set_log_state
-from gridworld.process.console import tell
-from gridworld.storage.serialization import (
+from gridworld.base.console import tell
+from gridworld.base.serialization import (
     State,
     StateError,
     fill,
@@ -41,6 +39,8 @@ from gridworld.storage.serialization import (
     set_generator_state,
     set_global_state,
 )
+from gridworld.config.fields import Decay
+from gridworld.engine.population import diverged, log_state, set_log_state
 
 _LIBRARIES = ("stable_baselines3", "sb3_contrib", "torch", "gridworld", "builtins")  # None is no part
 _NUMBERS = (

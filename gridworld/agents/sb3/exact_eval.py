@@ -25,14 +25,14 @@ from gridworld.agents.sb3.policy_outputs import (
     why_no_table,
     why_unreadable,
 )
-from gridworld.bounds import Bounds, discount
+from gridworld.base.atomic_write import replacing
+from gridworld.base.bounds import Bounds, discount
+from gridworld.base.errors import InputError, in_short
 from gridworld.config.compose import named_world
 from gridworld.envs.inspection import Task, observation_like, tabulated, task_of
 from gridworld.envs.observations import KINDS, ObservationTable
-from gridworld.errors import InputError, in_short
 from gridworld.run.folder import BEST_MODEL, EVALUATIONS
 from gridworld.run.writer import write_evaluations
-from gridworld.storage.atomic_write import replacing
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray, IntArray

@@ -18,9 +18,9 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 from torch.nn.functional import embedding, layer_norm, max_pool2d, normalize, pad, relu
 
+from gridworld.base.errors import InputError
 from gridworld.engine.networks import Kind
 from gridworld.envs.observations import IMAGE_CELL_SIZE
-from gridworld.errors import InputError
 
 _FEATURES, _MOST_FEATURES = 144, 4096
 

@@ -19,8 +19,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gridworld.errors import InputError, in_short
-from gridworld.storage.safe_read import read_bytes
+from gridworld.base.errors import InputError, in_short
+from gridworld.base.safe_read import read_bytes
 
 # {"policy": its state_dict, "policy.optimizer": {"0.exp_avg": ...}}
 Parameters = dict[str, dict[str, Tensor]]

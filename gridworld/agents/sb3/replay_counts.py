@@ -17,9 +17,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from gridworld.base.errors import InputError
+from gridworld.base.serialization import State, fill
 from gridworld.engine.replay import systematic_sample
-from gridworld.errors import InputError
-from gridworld.storage.serialization import State, fill
 from gridworld.world.mdp import IntArray
 
 _ROOM = 256  # transitions, at first

@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, Optional
 
-from gridworld.bounds import MOST_STEPS, Bounds
+from gridworld.base.bounds import MOST_STEPS, Bounds
+from gridworld.base.errors import InputError
 from gridworld.config.fields import (
     BOUNDS,
     MOST_KEPT,
@@ -26,7 +27,6 @@ from gridworld.config.fields import (
     rate,
 )
 from gridworld.config.train import AgentConfig, TrainConfig
-from gridworld.errors import InputError
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
 

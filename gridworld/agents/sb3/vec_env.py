@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from gridworld.base.errors import InputError
+from gridworld.base.serialization import independent_generator
 from gridworld.config.compose import named_world
 from gridworld.envs.observations import IMAGE_CELL_SIZE, ObservationTable, make_observation
 from gridworld.envs.vector_env import GridWorldVectorEnv, StateArray
-from gridworld.errors import InputError
-from gridworld.storage.serialization import independent_generator
 from gridworld.world.layout import CLASSIC, Layout
 from gridworld.world.mdp import Mdp
 

@@ -22,10 +22,10 @@ from gridworld.agents.tabular.td_control import (
     TabularControlConfig,
     epsilon_greedy,
 )
+from gridworld.base.errors import InputError
+from gridworld.base.serialization import State
 from gridworld.config.fields import Word, privilege
 from gridworld.config.train import AgentConfig
-from gridworld.errors import InputError
-from gridworld.storage.serialization import State
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 from gridworld.world.solver import value_iteration
 

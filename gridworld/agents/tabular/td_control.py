@@ -19,13 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, Hook, PolicySnapshot, SafePoint, TrainingContext, misfit
-from gridworld.bounds import Bounds
-from gridworld.config.fields import MOST_KEPT, Effect, Schedule, Word, affects, bounds, parse_schedule, rate
-from gridworld.config.train import AgentConfig, TrainConfig
-from gridworld.errors import InputError
-from gridworld.process.user_input import npz_arrays, npz_bytes
-from gridworld.storage.safe_read import read_bytes
-from gridworld.storage.serialization import (
+from gridworld.base.bounds import Bounds
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import read_bytes
+from gridworld.base.serialization import (
     State,
     fill,
     fitting,
@@ -33,6 +30,9 @@ from gridworld.storage.serialization import (
     independent_generator,
     set_generator_state,
 )
+from gridworld.base.user_input import npz_arrays, npz_bytes
+from gridworld.config.fields import MOST_KEPT, Effect, Schedule, Word, affects, bounds, parse_schedule, rate
+from gridworld.config.train import AgentConfig, TrainConfig
 from gridworld.world.mdp import LEAST_REWARD, MOST_REWARD, FloatArray, IntArray
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ import time
 from dataclasses import replace
 
 from gridworld.agents.sb3.settings import SB3ClassConfig
+from gridworld.base.errors import InputError
 from gridworld.config.train import AgentConfig
 from gridworld.diagnosis.evidence import Evidence, Finding
-from gridworld.errors import InputError
 from gridworld.training.setup import make_context
 
 _LIBRARIES = ("stable_baselines3", "sb3_contrib")

@@ -34,8 +34,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.errors import InputError, in_short
-from gridworld.process.user_input import check_memory, imported, npz_arrays, npz_bytes, open_users_file
+from gridworld.base.errors import InputError, in_short
+from gridworld.base.user_input import check_memory, imported, npz_arrays, npz_bytes, open_users_file
 from gridworld.world.mdp import Mdp, frozen
 from gridworld.world.outcomes import Outcomes, checked_text, mdp_from_outcomes, verified
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 from gridworld.world.mdp import Mdp, grid_places
 from gridworld.world.outcomes import MOST_ACTIONS, MOST_STATES, Outcomes, mdp_from_outcomes
 

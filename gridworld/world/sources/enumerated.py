@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order
 
-from gridworld.errors import InputError
-from gridworld.process.console import telling_if_slow
-from gridworld.process.user_input import check_memory
+from gridworld.base.console import telling_if_slow
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import check_memory
 from gridworld.world.mdp import BoolArray, Mdp
 from gridworld.world.outcomes import MOST_ACTIONS, MOST_STATES, Outcomes, mdp_from_outcomes
 from gridworld.world.reach import Reach

@@ -21,7 +21,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.errors import InputError, in_short, install_command
+from gridworld.base.errors import InputError, in_short, install_command
 from gridworld.world.mdp import Mdp, grid_places
 from gridworld.world.outcomes import Outcomes, check_size, mdp_from_outcomes
 from gridworld.world.sources.table_walk import walk

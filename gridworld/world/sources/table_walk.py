@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 from gridworld.world.outcomes import Outcomes
 from gridworld.world.solver import backup

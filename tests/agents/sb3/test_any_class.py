@@ -9,8 +9,8 @@ import pytest
 from helpers.own_class import OWN_CLASS, any_class, importable
 from helpers.support import NO_FILES, SHORT, configure, script
 
-from gridworld.errors import InputError
-from gridworld.restore.saved_run import SavedRun
+from gridworld.base.errors import InputError
+from gridworld.training.saved_run import SavedRun
 from gridworld.training.train import train
 
 OWN_YAML = """# @package _global_

@@ -16,12 +16,12 @@ from helpers.resuming import begin, differences, go_on, left_behind, rows, stopp
 from helpers.support import SHORT, configure
 
 from gridworld.agents.sb3.model_file import read_weights
+from gridworld.base.errors import InputError
 from gridworld.config.recipe_file import overrides
-from gridworld.errors import InputError
-from gridworld.restore.resume import open_unfinished
-from gridworld.restore.saved_run import SavedRun, settings_of
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.reader import check_free, read_run
+from gridworld.training.resume import open_unfinished
+from gridworld.training.saved_run import SavedRun, settings_of
 
 MODULE = """
 import numpy as np

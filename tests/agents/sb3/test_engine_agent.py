@@ -16,7 +16,7 @@ import gridworld
 from gridworld.agents import Agent
 from gridworld.agents.sb3.agent import ACTIVATIONS, EngineAgent, SB3Agent
 from gridworld.agents.sb3.callbacks import FallingSetting
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 from gridworld.training.setup import make_context
 
 

@@ -14,8 +14,8 @@ from torch import Tensor
 
 import gridworld
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
+from gridworld.base.errors import InputError
 from gridworld.envs.observations import make_observation
-from gridworld.errors import InputError
 
 PLANE, IMAGE = spaces.Box(0, 1, (2,), np.float32), spaces.Box(0, 255, (3, 8, 9), np.uint8)
 

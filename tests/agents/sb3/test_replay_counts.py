@@ -18,10 +18,10 @@ from stable_baselines3 import DQN
 from gridworld import GridWorldVectorEnv
 from gridworld.agents.sb3.replay_counts import ReplayCounts
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
+from gridworld.base.errors import InputError
+from gridworld.base.serialization import StateError
 from gridworld.engine.replay import CountedReplay, systematic_sample
 from gridworld.envs.observations import make_observation
-from gridworld.errors import InputError
-from gridworld.storage.serialization import StateError
 
 COUNTS = "agent.replay_buffer_class=gridworld.agents.sb3.replay_counts.ReplayCounts"
 NUM_ENVS = 16

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridworld import InputError, compile_mdp, load
-from gridworld.process.user_input import npz_bytes
+from gridworld.base.user_input import npz_bytes
 from gridworld.world.chain import Chain
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes

@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources.enumerated import enumerate_env

@@ -12,7 +12,7 @@ from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv, generate_random_m
 from gymnasium.envs.toy_text.taxi import TaxiEnv
 from gymnasium.envs.toy_text.utils import categorical_sample
 
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 from gridworld.world.sources import table_walk
 from gridworld.world.sources.gymnasium_table import compile_gymnasium, compile_table
 

@@ -14,13 +14,13 @@ from typing import Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
 
+from gridworld.base.console import repeating
+from gridworld.base.errors import InputError, install_command
+from gridworld.base.processes import LostError, Processes, can_fork, worker_count
 from gridworld.config.train import check_bounds
-from gridworld.errors import InputError, install_command
-from gridworld.process.console import repeating
-from gridworld.process.processes import LostError, Processes, can_fork, worker_count
-from gridworld.sweep.folder import STOP
-from gridworld.sweep.job import StopSweep, Worker
-from gridworld.sweep.plan import Job, runs_apart
+from gridworld.sweeps.folder import STOP
+from gridworld.sweeps.job import StopSweep, Worker
+from gridworld.sweeps.plan import Job, runs_apart
 from gridworld.training.setup import import_for
 
 # By the launcher: the package that it needs, and commands.
@@ -65,7 +65,7 @@ def launcher_settings(config: DictConfig) -> tuple[str, dict[str, Any]]:
 def run_groups(launch: Launch, launcher: str, own: Mapping[str, Any]) -> None:
     """Run populations. Raises `StopSweep`, `SystemExit`, or `InputError` where a cluster takes no jobs."""
     if launcher in _NEEDS:
-        import_module(f"gridworld.sweep.launchers.{launcher}").run(launch, own)
+        import_module(f"gridworld.sweeps.launchers.{launcher}").run(launch, own)
         return
     apart: list[partial[list[str]]] = []  # in other processes
     here: list[partial[list[str]]] = []  # in this one, when the others have ended

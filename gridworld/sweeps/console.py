@@ -16,14 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gridworld.base.console import aligned, command, command_line, duration, printable
+from gridworld.base.errors import InputError
 from gridworld.config.fields import Effect
 from gridworld.config.settings import ON_RESULT, effect_of, flat, with_effects
 from gridworld.envs.rollout import wilson_interval
-from gridworld.errors import InputError
-from gridworld.process.console import aligned, command, command_line, duration, printable
 from gridworld.run.folder import shell_path
 from gridworld.run.reader import read_run
-from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
+from gridworld.sweeps.folder import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
 
 _HEADINGS = ("agent", "task", "settings", "certified", "median steps")
 _OF_SETTINGS = ON_RESULT - {Effect.SEED, Effect.LABELS, Effect.MACHINE}

@@ -20,20 +20,20 @@ from pathlib import Path, PurePath
 from types import MappingProxyType
 from typing import Any
 
-from gridworld.errors import InputError
-from gridworld.process.console import recorded_command_line
-from gridworld.run.folder import ERROR_FILE, HYDRA, LOCK, MANIFEST, SWEEP_JSON, alone_in, check_writable
-from gridworld.run.provenance import settings_hash, versions
-from gridworld.run.reader import RunReader, find_run
-from gridworld.storage.atomic_write import (
+from gridworld.base.atomic_write import (
     check_no_links,
     is_locked,
     make_folder,
     write_json,
     write_text,
 )
-from gridworld.storage.safe_read import LARGEST_JSON, csv_text, read_bytes, read_sealed, sealed
-from gridworld.sweep.plan import Job
+from gridworld.base.console import recorded_command_line
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import LARGEST_JSON, csv_text, read_bytes, read_sealed, sealed
+from gridworld.run.folder import ERROR_FILE, HYDRA, LOCK, MANIFEST, SWEEP_JSON, alone_in, check_writable
+from gridworld.run.provenance import settings_hash, versions
+from gridworld.run.reader import RunReader, find_run
+from gridworld.sweeps.plan import Job
 
 JOBS_CSV = "jobs.csv"
 STOP = ".stop"  # in the sweep's folder: no more jobs begin, wherever they wait

@@ -30,12 +30,12 @@ from omegaconf import OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.agents import Learning
-from gridworld.bounds import LARGEST_INTEGER
+from gridworld.base.bounds import LARGEST_INTEGER
+from gridworld.base.errors import InputError, reason
+from gridworld.base.processes import LostError
+from gridworld.base.signals import handling
 from gridworld.config.compose import to_config
 from gridworld.config.train import TrainConfig
-from gridworld.errors import InputError, reason
-from gridworld.process.processes import LostError
-from gridworld.process.signals import handling
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.setup import check_settings, make_context
 from gridworld.training.together import Training, run_together

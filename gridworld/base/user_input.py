@@ -25,7 +25,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from gridworld.errors import InputError, install_command
+from gridworld.base.errors import InputError, install_command
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,7 +1,7 @@
 """The plugin for Hydra: the sweeper.
 
 Installed, this file is `hydra_plugins/gridworld_sweeper.py`: Hydra takes plugins from that namespace only. It
-imports them in every program, so this module is light; `gridworld.sweep.sweeper` does the work.
+imports them in every program, so this module is light; `gridworld.sweeps.sweeper` does the work.
 """
 
 from __future__ import annotations
@@ -26,6 +26,6 @@ class GridWorldSweeper(Sweeper):
     def sweep(self, arguments: list[str]) -> None:
         """Run the jobs that `arguments` ask for. Raises `SystemExit` unless all are done."""
         from gridworld.config.sweep import SweepConfig
-        from gridworld.sweep.sweeper import run_sweep
+        from gridworld.sweeps.sweeper import run_sweep
 
         run_sweep(arguments, self._context, self._config, SweepConfig(**self._settings))

@@ -41,6 +41,9 @@ from optuna.distributions import (
 )
 from yaml import YAMLError
 
+from gridworld.base.console import program
+from gridworld.base.errors import InputError
+from gridworld.base.processes import core_count
 from gridworld.config.compose import compose_run, compose_whole, register_schemas, search_path, slug
 from gridworld.config.fields import Effect
 from gridworld.config.recipe_file import CHOSEN, with_recipe
@@ -48,11 +51,8 @@ from gridworld.config.settings import effect_of
 from gridworld.config.sweep import DimensionConfig, TuneConfig
 from gridworld.config.train import AUTO, TrainConfig, check_bounds
 from gridworld.config.words import conf_folder, sentence
-from gridworld.errors import InputError
-from gridworld.process.console import program
-from gridworld.process.processes import core_count
+from gridworld.sweeps.tune.objective import Objective, Values, with_values
 from gridworld.training.setup import check_settings
-from gridworld.tune.objective import Objective, Values, with_values
 from gridworld.world.mdp import Mdp
 
 _GIVEN = (Effect.TASK, Effect.LENGTH, Effect.EVALUATION, Effect.SEED)

@@ -16,19 +16,19 @@ from pathlib import Path
 from hydra.types import HydraContext
 from omegaconf import DictConfig, open_dict, read_write
 
+from gridworld.base.atomic_write import inside, write_text
+from gridworld.base.console import ProgressLine, tell, tell_error, time_left
+from gridworld.base.errors import InputError, reason
+from gridworld.base.processes import LostError
+from gridworld.base.signals import exiting, signal_name
 from gridworld.config.sweep import SweepConfig
 from gridworld.config.words import prepared
-from gridworld.errors import InputError, reason
-from gridworld.process.console import ProgressLine, tell, tell_error, time_left
-from gridworld.process.processes import LostError
-from gridworld.process.signals import exiting, signal_name
 from gridworld.run.folder import ERROR_FILE, shell_path
-from gridworld.storage.atomic_write import inside, write_text
-from gridworld.sweep import console
-from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, JobRow, SweepFolder
-from gridworld.sweep.job import StopSweep, Worker, mark_failed, run_status
-from gridworld.sweep.launchers import Group, Launch, launcher_settings, run_groups
-from gridworld.sweep.plan import Configurations, Job, expand, largest_population, plan, populations
+from gridworld.sweeps import console
+from gridworld.sweeps.folder import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, JobRow, SweepFolder
+from gridworld.sweeps.job import StopSweep, Worker, mark_failed, run_status
+from gridworld.sweeps.launchers import Group, Launch, launcher_settings, run_groups
+from gridworld.sweeps.plan import Configurations, Job, expand, largest_population, plan, populations
 
 _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
 _POLL_SECONDS = 0.1

@@ -20,9 +20,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
 
-from gridworld.process.console import tell
-from gridworld.process.signals import blocking, exiting, handling, send_sigterm
-from gridworld.process.together import LARGEST
+from gridworld.base.console import tell
+from gridworld.base.signals import blocking, exiting, handling, send_sigterm
+from gridworld.base.together import LARGEST
 
 Task = Callable[..., Any]
 T = TypeVar("T")

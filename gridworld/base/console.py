@@ -25,8 +25,8 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from gridworld.errors import InputError
-from gridworld.process.user_input import is_limited, users_folder
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import is_limited, users_folder
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer

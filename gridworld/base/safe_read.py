@@ -25,10 +25,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-from gridworld.bounds import LARGEST_INTEGER
-from gridworld.errors import InputError
-from gridworld.process.console import plain
-from gridworld.process.user_input import check_memory
+from gridworld.base.bounds import LARGEST_INTEGER
+from gridworld.base.console import plain
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import check_memory
 
 LARGEST_JSON = 4 * 2**20  # bytes
 LARGEST_CSV = 64 * 2**20

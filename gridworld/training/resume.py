@@ -15,23 +15,23 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from gridworld.base.atomic_write import holds
+from gridworld.base.console import printable, tell, telling_if_slow
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import open_ordinary
+from gridworld.base.serialization import State, StateError
 from gridworld.config.fields import falls
 from gridworld.config.settings import flat, foreign
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig
-from gridworld.errors import InputError
-from gridworld.process.console import printable, tell, telling_if_slow
-from gridworld.restore.saved_run import settings_of
 from gridworld.run.checkpoints import MOST_STEPS, Checkpoints, steps_of
 from gridworld.run.folder import CHECKPOINTS, CURVE
 from gridworld.run.provenance import environment, git, identity, settings, source_differences
 from gridworld.run.reader import RunReader, read_run, stored_world
 from gridworld.run.summary import Summary
 from gridworld.run.writer import RunWriter, TrainLog
-from gridworld.storage.atomic_write import holds
-from gridworld.storage.safe_read import open_ordinary
-from gridworld.storage.serialization import State, StateError
 from gridworld.training.learning_curve import CURVE_COLUMNS
+from gridworld.training.saved_run import settings_of
 from gridworld.training.session import CONTENT, FORMAT, LOGS, OnBuilt, ignore
 from gridworld.training.setup import check_settings
 from gridworld.training.together import Training, alone

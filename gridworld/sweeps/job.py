@@ -18,19 +18,19 @@ import yaml
 from hydra.core.utils import JobReturn, JobStatus, configure_log
 from omegaconf import DictConfig, OmegaConf
 
+from gridworld.base.atomic_write import locked, write_bytes, write_text
+from gridworld.base.console import prepare
+from gridworld.base.errors import FolderLostError, InputError, MachineError, reason
+from gridworld.base.signals import Interrupted, exiting, handling, send_sigterm
+from gridworld.base.together import mixing
+from gridworld.base.user_input import called_from
 from gridworld.config.train import AUTO, TrainConfig
-from gridworld.errors import FolderLostError, InputError, MachineError, reason
-from gridworld.process.console import prepare
-from gridworld.process.signals import Interrupted, exiting, handling, send_sigterm
-from gridworld.process.together import mixing
-from gridworld.process.user_input import called_from
-from gridworld.restore.resume import unfinished_of
 from gridworld.run.folder import ERROR_FILE, LOCK, MANIFEST
 from gridworld.run.reader import find_run, is_started
 from gridworld.run.writer import clear, record_failure
-from gridworld.storage.atomic_write import locked, write_bytes, write_text
-from gridworld.sweep.folder import STOP, one_line
-from gridworld.sweep.plan import Job
+from gridworld.sweeps.folder import STOP, one_line
+from gridworld.sweeps.plan import Job
+from gridworld.training.resume import unfinished_of
 from gridworld.training.together import Training, run_together
 from gridworld.training.train import training
 

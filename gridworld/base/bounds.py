@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from gridworld.errors import InputError
+from gridworld.base.errors import InputError
 
 STEP_LIMIT = 100  # steps of an episode, where neither the world nor a setting says another
 MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them

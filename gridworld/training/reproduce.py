@@ -22,17 +22,17 @@ from typing import Any
 
 import numpy as np
 
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import LARGEST_CSV, as_table
+from gridworld.base.together import mixing
 from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
-from gridworld.errors import InputError
-from gridworld.process.together import mixing
-from gridworld.restore.resume import open_unfinished
-from gridworld.restore.saved_run import read_visits, settings_of
 from gridworld.run.folder import EVENTS, MANIFEST
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import LARGEST_RESULT, NUMBERS_DEPEND_ON, RunReader, read_run, stored_world
 from gridworld.run.summary import Summary
-from gridworld.storage.safe_read import LARGEST_CSV, as_table
+from gridworld.training.resume import open_unfinished
+from gridworld.training.saved_run import read_visits, settings_of
 from gridworld.training.session import CLOCK
 from gridworld.training.setup import without_pictures
 from gridworld.training.tensorboard import read_scalars

@@ -21,20 +21,20 @@ import numpy as np
 from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
 
+from gridworld.base.atomic_write import check_no_links, inside, remove_path
+from gridworld.base.console import tell
+from gridworld.base.errors import InputError
+from gridworld.base.processes import LostError, Processes
 from gridworld.config.train import TrainConfig
-from gridworld.errors import InputError
-from gridworld.process.console import tell
-from gridworld.process.processes import LostError, Processes
 from gridworld.report import statistics
 from gridworld.report.tables import number, steps_up_to
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import find_run
-from gridworld.storage.atomic_write import check_no_links, inside, remove_path
-from gridworld.sweep.folder import FAILED, job_row
-from gridworld.sweep.job import JobError, run_in_sweep
+from gridworld.sweeps.folder import FAILED, job_row
+from gridworld.sweeps.job import JobError, run_in_sweep
+from gridworld.sweeps.tune.objective import FINAL, SEEDS, Outcome, SeedScore, Trials, read_score, score
+from gridworld.sweeps.tune.study_spec import StudySpec
 from gridworld.training.together import Training, run_together
-from gridworld.tune.objective import FINAL, SEEDS, Outcome, SeedScore, Trials, read_score, score
-from gridworld.tune.study_spec import StudySpec
 from gridworld.world.mdp import FloatArray
 
 CONFIRM = "confirm"  # the folder of the winner's runs, in the study's

@@ -27,15 +27,15 @@ from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from gridworld.base.errors import InputError
+from gridworld.base.processes import file_limit, free_memory, worker_count
+from gridworld.base.together import LARGEST
 from gridworld.config.compose import drop_hydra, to_config
 from gridworld.config.presets import with_preset
 from gridworld.config.settings import foreign, has_own_code
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.config.words import prepared
 from gridworld.config.worlds import EnvConfig
-from gridworld.errors import InputError
-from gridworld.process.processes import file_limit, free_memory, worker_count
-from gridworld.process.together import LARGEST
 from gridworld.run.provenance import settings_hash
 from gridworld.training.setup import check_settings, notes
 from gridworld.world.mdp import Mdp

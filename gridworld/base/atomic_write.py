@@ -32,8 +32,8 @@ from typing import Any, BinaryIO, cast
 
 from filelock import FileLock, Timeout
 
-from gridworld.errors import FolderLostError
-from gridworld.storage.safe_read import check_no_link, open_ordinary
+from gridworld.base.errors import FolderLostError
+from gridworld.base.safe_read import check_no_link, open_ordinary
 
 _SECONDS_BETWEEN_TRIES = 0.02
 _PIECE = 1 << 20  # bytes of a log that are read at once

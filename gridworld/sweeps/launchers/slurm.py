@@ -17,11 +17,11 @@ from typing import Any
 
 import submitit
 
-from gridworld.errors import InputError
-from gridworld.process.console import printable
-from gridworld.process.processes import LostError
-from gridworld.storage.atomic_write import inside, remove_path
-from gridworld.sweep.launchers import Group, Launch, collect
+from gridworld.base.atomic_write import inside, remove_path
+from gridworld.base.console import printable
+from gridworld.base.errors import InputError
+from gridworld.base.processes import LostError
+from gridworld.sweeps.launchers import Group, Launch, collect
 
 _FOLDER = ".slurm"  # in the sweep's: what submitit writes
 _SECONDS_BETWEEN_QUESTIONS = 5.0  # to Slurm, which answers others too

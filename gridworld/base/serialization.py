@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.errors import InputError
-from gridworld.process.user_input import BudgetError, check_memory, npz_arrays
-from gridworld.storage.safe_read import AS_JSON
+from gridworld.base.errors import InputError
+from gridworld.base.safe_read import AS_JSON
+from gridworld.base.user_input import BudgetError, check_memory, npz_arrays
 
 State = dict[str, Any]
 

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot
+from gridworld.base.console import tell
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import DAMAGED, limited
 from gridworld.config.settings import check_foreign, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import MapConfig
-from gridworld.errors import InputError
-from gridworld.process.console import tell
-from gridworld.process.user_input import DAMAGED, limited
 from gridworld.run.folder import shown
 from gridworld.run.reader import RunReader, open_run, stored_world
 from gridworld.training.setup import make_context

@@ -11,12 +11,12 @@ from typing import Any
 import ray
 from ray.exceptions import RayError, TaskCancelledError
 
-from gridworld.errors import InputError
-from gridworld.process.processes import LostError
-from gridworld.process.signals import handling
-from gridworld.sweep.job import StopSweep, Worker
-from gridworld.sweep.launchers import Launch, collect
-from gridworld.sweep.plan import Job
+from gridworld.base.errors import InputError
+from gridworld.base.processes import LostError
+from gridworld.base.signals import handling
+from gridworld.sweeps.job import StopSweep, Worker
+from gridworld.sweeps.launchers import Launch, collect
+from gridworld.sweeps.plan import Job
 
 _ENDED_WITHIN = 1.0  # seconds
 

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
+from gridworld.base.console import aligned, command
+from gridworld.base.errors import InputError
 from gridworld.config.presets import fitting_preset, is_world
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.config.words import conf_folder, own_conf_folders
-from gridworld.errors import InputError
-from gridworld.process.console import aligned, command
-from gridworld.restore.saved_run import SavedRun
 from gridworld.run.folder import SWEEP_JSON, RunFolder, shell_path
 from gridworld.run.reader import LARGEST_RESULT, RunReader
+from gridworld.training.saved_run import SavedRun
 
 _FALLS = 0.95  # of the regret in the quarter of the curve before the last
 _FEWEST = 8  # evaluations

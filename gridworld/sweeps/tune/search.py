@@ -29,15 +29,15 @@ from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
-from gridworld.errors import InputError
-from gridworld.process.console import ProgressLine, tell, time_left
-from gridworld.process.processes import LostError, Processes
+from gridworld.base.atomic_write import write_text
+from gridworld.base.console import ProgressLine, tell, time_left
+from gridworld.base.errors import InputError
+from gridworld.base.processes import LostError, Processes
+from gridworld.base.safe_read import csv_text
 from gridworld.report.tuning_study import TRIALS_CSV
 from gridworld.run.folder import shell_path
-from gridworld.storage.atomic_write import write_text
-from gridworld.storage.safe_read import csv_text
-from gridworld.sweep.folder import one_line
-from gridworld.tune.objective import (
+from gridworld.sweeps.folder import one_line
+from gridworld.sweeps.tune.objective import (
     DRAW,
     ERROR,
     FINAL,
@@ -49,7 +49,7 @@ from gridworld.tune.objective import (
     Values,
     read_score,
 )
-from gridworld.tune.study_spec import SearchSpace, StudySpec
+from gridworld.sweeps.tune.study_spec import SearchSpace, StudySpec
 
 # Attributes of the study.
 ABOUT = "gridworld"  # what makes its trials comparable

@@ -29,32 +29,30 @@ import optuna
 from omegaconf import OmegaConf
 from optuna.trial import FrozenTrial, TrialState
 
-from gridworld.config.compose import compose_run, search_path
-from gridworld.config.fields import Effect
-from gridworld.config.recipe_file import IN_A_STUDY, TRUST, overrides
-from gridworld.config.settings import ON_RESULT, flat, with_effects
-from gridworld.config.train import TrainConfig
-from gridworld.config.words import conf_folder
-from gridworld.errors import InputError
-from gridworld.process.console import command, printable, recorded_command_line, tell
-from gridworld.process.processes import Processes, can_fork
-from gridworld.process.signals import Interrupted, exiting
-from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
-from gridworld.report.writer import write_over_seeds
-from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, check_writable, claimed, shell_path
-from gridworld.run.provenance import versions
-from gridworld.storage.atomic_write import (
+from gridworld.base.atomic_write import (
     check_no_links,
     inside,
     is_locked,
     write_json,
     write_text,
 )
-from gridworld.storage.safe_read import LARGEST_CSV, file_sha256, read_sealed, sealed
-from gridworld.sweep.plan import may_fork
-from gridworld.training.setup import import_for
-from gridworld.training.tensorboard import hparams
-from gridworld.tune.confirmation import (
+from gridworld.base.console import command, printable, recorded_command_line, tell
+from gridworld.base.errors import InputError
+from gridworld.base.processes import Processes, can_fork
+from gridworld.base.safe_read import LARGEST_CSV, file_sha256, read_sealed, sealed
+from gridworld.base.signals import Interrupted, exiting
+from gridworld.config.compose import compose_run, search_path
+from gridworld.config.fields import Effect
+from gridworld.config.recipe_file import IN_A_STUDY, TRUST, overrides
+from gridworld.config.settings import ON_RESULT, flat, with_effects
+from gridworld.config.train import TrainConfig
+from gridworld.config.words import conf_folder
+from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
+from gridworld.report.writer import write_over_seeds
+from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, check_writable, claimed, shell_path
+from gridworld.run.provenance import versions
+from gridworld.sweeps.plan import may_fork
+from gridworld.sweeps.tune.confirmation import (
     CONFIRM,
     Finalist,
     HeldOutRun,
@@ -66,9 +64,11 @@ from gridworld.tune.confirmation import (
     run_held_out,
     verdict_on,
 )
-from gridworld.tune.objective import ERROR, with_values
-from gridworld.tune.search import SearchError, in_reach, open_study, search, study_url
-from gridworld.tune.study_spec import StudySpec
+from gridworld.sweeps.tune.objective import ERROR, with_values
+from gridworld.sweeps.tune.search import SearchError, in_reach, open_study, search, study_url
+from gridworld.sweeps.tune.study_spec import StudySpec
+from gridworld.training.setup import import_for
+from gridworld.training.tensorboard import hparams
 
 SEARCH_JSON = "search.json"
 _EXPERIMENT, _WINNER = IN_A_STUDY
