@@ -59,7 +59,7 @@ def failure(error: OSError) -> str:
 
 def install_command(extra: str) -> str:
     """What installs an optional part, of a checkout or of an installed wheel."""
-    checkout = Path(__file__).parents[1]
+    checkout = Path(__file__).parents[2]
     if (checkout / "pyproject.toml").is_file():
         return f"pip install -e {shlex.quote(f'{checkout}[{extra}]')}"
     return f"pip install '{DISTRIBUTION}[{extra}]'"  # pip finds the wheel installed, and adds what is missing

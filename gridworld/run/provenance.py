@@ -98,7 +98,7 @@ def versions() -> dict[str, str | None]:
 def code() -> str:
     """A hash of the package's source files, SHA-256 as hexadecimal digits."""
     found = hashlib.sha256()
-    elsewhere = _PACKAGE / "sweep" / "hydra_plugin.py"  # in a wheel; no number depends on it
+    elsewhere = _PACKAGE / "sweeps" / "hydra_plugin.py"  # in a wheel; no number depends on it
     for path in sorted({*_PACKAGE.rglob("*.py")} - {elsewhere}):
         found.update(f"{path.relative_to(_PACKAGE).as_posix()} {sha256(path.read_bytes())}\n".encode())
     return found.hexdigest()

@@ -25,6 +25,7 @@ import gymnasium as gym
 import numpy as np
 
 from gridworld.base.errors import InputError, in_short
+from gridworld.world.mdp import Mdp
 from gridworld.world.reading import (
     OF_A_CLASS,
     PLAIN,
@@ -60,15 +61,23 @@ _MOST_IN_TURN = 100  # arguments, up to which every one is asked after every oth
 
 
 class _Below(gym.Env[Any, Any]):
-    """What a method finds in place of the environment below: spaces. It notes what else was looked for."""
+    """What a method finds in place of the environment below: spaces, and of a world here its tables.
+
+    It notes what else was looked for.
+    """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         spaces = {name: getattr(env, name) for name in _SPACES}
-        object.__getattribute__(self, "__dict__").update(copy.deepcopy(spaces), looked_for=[])
+        held = object.__getattribute__(self, "__dict__")
+        held.update(copy.deepcopy(spaces), looked_for=[])
+        if isinstance(mdp := getattr(env.unwrapped, "mdp", None), Mdp):  # which never changes
+            held.update(mdp=mdp)
 
     def __getattribute__(self, name: str) -> Any:
         held = object.__getattribute__(self, "__dict__")
-        if name not in _SPACES:
+        if name == "unwrapped" and "mdp" in held:
+            return self
+        if name not in (*_SPACES, "mdp") or name not in held:
             held["looked_for"].append(name)
             raise AttributeError(name)
         return held[name]
@@ -285,7 +294,7 @@ class _MemoryError(Exception):
 
 
 class _Copy:
-    """A copy of a wrapper, with nothing below it but spaces, to ask."""
+    """A copy of a wrapper to ask, with a `_Below` in place of the environment."""
 
     def __init__(self, where: str, owner: Any, method: str) -> None:
         below = _Below(owner.env)
@@ -293,7 +302,8 @@ class _Copy:
         refuse_hiding(owner)
         other = copy.deepcopy(owner, {id(owner.env): below})
         self._method = getattr(other, method)
-        self.content = Reach(where, other, method, [below], self._below).content
+        known = [below, *(each for each in self._below.values() if isinstance(each, Mdp))]
+        self.content = Reach(where, other, method, known, self._below).content
 
     def ask(self, argument: Any) -> Any:
         try:

@@ -136,7 +136,7 @@ def test_what_differs_in_the_environment_is_told(
     assert "    ATEN_CPU_CAPABILITY: \\x1b[2Javx2 then, none now" in shown
     assert "    resumed after step 512: numpy 1 is now 2\\x1b[2J (anyway=true)\n" in shown
     assert "    resumed after step 512: commit: abc then, later now\n" in shown
-    assert "600" not in shown
+    assert "step 600" not in shown
     assert not list(differences(describe(), describe()))
 
 
