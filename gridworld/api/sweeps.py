@@ -63,7 +63,8 @@ class SweepResult:
             if row.status == sweep_folder.DONE:
                 summary = read_run(self.folder / row.job).read_summary()
                 content |= {k: each for k, each in summary.items() if not isinstance(each, dict | list)}
-                content["regret"] *= not summary["certified"]  # 0 but for rounding
+                if summary["certified"]:
+                    content["regret"] = 0.0  # but for rounding
             rows.append(content)
         return rows
 

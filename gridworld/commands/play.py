@@ -22,6 +22,7 @@ from gridworld.base.user_input import limited
 from gridworld.commands import parser_of, whole
 from gridworld.config.compose import compose
 from gridworld.config.train import EvaluationConfig
+from gridworld.config.words import refuse_unclear
 from gridworld.config.worlds import GymnasiumConfig, MapConfig
 from gridworld.envs import rendering as drawing
 from gridworld.envs.rendering import Frame
@@ -279,6 +280,7 @@ def _game(options: argparse.Namespace) -> Game:
     given = {name: getattr(options, name) for name in _WORLD if getattr(options, name) is not None}
     if options.agent is not None and (fixed := [*options.words, *given.keys() & {"num_rows", "num_cols"}]):
         raise InputError(f"{fixed[0]}: with --agent, the world has the size it was trained on")
+    refuse_unclear(options.words)
     saved = None if options.agent is None else SavedRun(options.agent, options.trust, options.best)
     config = saved.config if saved is not None else compose(options.words) if options.words else None
     env = MapConfig() if config is None else config.env

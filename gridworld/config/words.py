@@ -170,6 +170,7 @@ def sentence(error: BaseException) -> str:
         r"Could not override '([^']*)': Key '[^']*' not in '(\w+)'", r"\1: no such setting in \2", text
     )
     text = re.sub(r": (mismatched input|no viable alternative|extraneous input|token recog).*", _SYNTAX, text)
+    text = re.sub(r"^LexerNoViableAltException: (.*)", r"\1: a quotation mark has no partner", text)
     return text + _suggestion(" ".join(facts), message)
 
 
