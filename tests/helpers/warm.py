@@ -63,7 +63,7 @@ _WORDS = (
 )
 # What is imported only once it is needed.
 _LATE = (
-    *("sb3_contrib", "torch.utils.tensorboard", "torch.utils.serialization", "av"),
+    *("sb3_contrib", "torch.utils.tensorboard", "torch.utils.serialization", "torch._dynamo", "av"),
     *("optuna.storages._rdb.storage", "optuna.storages._rdb.models", "sqlalchemy.orm"),
     *("sqlalchemy.dialects.sqlite.pysqlite", "alembic.command", "alembic.config", "alembic.migration"),
     *("optuna.importance._fanova", "gridworld.report.agent_charts", "gridworld.report.setting_charts"),
