@@ -19,7 +19,7 @@ from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from gridworld.base.serialization import State
 from gridworld.engine.networks import Array, Networks, make_networks
-from gridworld.engine.population import FEW_STATES, Population, Run, met_states
+from gridworld.engine.population import FEW_STATES, Population, Run
 from gridworld.engine.replay import CountedReplay, Replay, Transitions, UniformReplay
 from gridworld.envs.vector_env import Step
 from gridworld.world.mdp import FloatArray, IntArray
@@ -33,7 +33,7 @@ class DQN(Population):
         self._greedy: IntArray | None = None  # (P, S), by these
         self._best: Array | None = None  # (P, S), what the target networks say of each state's best action
         targets = [run.target for run in runs if run.target is not None]
-        self.target = make_networks(targets, met_states(runs[0]))
+        self.target = make_networks(targets, runs[0].met)
         model, envs = runs[0].model, runs[0].envs
         self.replay: Replay = (
             CountedReplay(len(runs), envs.mdp.num_states, envs.mdp.num_actions)

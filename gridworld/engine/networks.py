@@ -155,10 +155,11 @@ class DenseNetworks(_Rows):
         """Outputs (P, S, n), of the states that are ever met; 0 in the others."""
         if self._met is None:
             return self.run()
-        found, count = self.run(self._met.cpu().numpy()), self._columns[0].shape[1]
+        met = self._met.cpu().numpy()
+        found, count = self.run(met), self._columns[0].shape[1]
         tables = [np.zeros((each.shape[0], count, each.shape[2]), each.dtype) for each in found]
         for table, each in zip(tables, found, strict=True):
-            table[:, self._met.cpu().numpy()] = each
+            table[:, met] = each
         return tuple(tables)
 
     def _run(self, output: int) -> list[Tensor | None]:

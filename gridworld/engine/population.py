@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import time
 import weakref
@@ -62,6 +63,22 @@ class Run:
 
     def __post_init__(self) -> None:
         self.begin(1)
+
+    @functools.cached_property
+    def met(self) -> IntArray | None:
+        """The states (U,) of a large world that it can meet within its step limit; None if those are all.
+
+        Without weight decay, a first layer of unit vectors never changes in the columns of the others.
+        """
+        mdp, settings = self.envs.mdp, self.model.policy.optimizer.param_groups[0]
+        if mdp.num_states <= FEW_STATES or not self.network.is_look_up or settings.get("weight_decay"):
+            return None
+        found, front = mdp.start > 0, mdp.start_states
+        for _ in range(min(self.envs.step_limit, mdp.num_states)):
+            following = mdp.next_state[front][mdp.probability[front] > 0]
+            front = np.unique(following[~found[following]])
+            found[front] = True
+        return None if found.all() else np.flatnonzero(found)
 
     def begin(self, total_timesteps: int) -> None:
         """Prepare SB3's model as its `learn` does."""
@@ -224,7 +241,7 @@ class Population:
     @classmethod
     def networks_of(cls, runs: Sequence[Run]) -> list[Networks]:
         """The networks that runs learn with, as far as they differ in kind; the first acts."""
-        return [make_networks([run.network for run in runs], met_states(runs[0]))]
+        return [make_networks([run.network for run in runs], runs[0].met)]
 
     def _optimizer(self) -> Optimizer:
         own = [run.model.policy.optimizer for run in self.runs]
@@ -345,22 +362,6 @@ def train(runs: Sequence[Run], states: Sequence[State | None]) -> None:
                         run.error = run.failed_update = error
     for run in runs:
         run.on_step = run.on_safe_point = None  # which hold what holds the run
-
-
-def met_states(run: Run) -> IntArray | None:
-    """The states (U,) of a large world that a run can meet within its step limit; None if those are all.
-
-    Without weight decay, a first layer of unit vectors never changes in the columns of the others.
-    """
-    mdp, settings = run.envs.mdp, run.model.policy.optimizer.param_groups[0]
-    if mdp.num_states <= FEW_STATES or not run.network.is_look_up or settings.get("weight_decay"):
-        return None
-    found, front = mdp.start > 0, mdp.start_states
-    for _ in range(min(run.envs.step_limit, mdp.num_states)):
-        following = mdp.next_state[front][mdp.probability[front] > 0]
-        front = np.unique(following[~found[following]])
-        found[front] = True
-    return None if found.all() else np.flatnonzero(found)
 
 
 _agreed: dict[Hashable, bool] = {}  # by kind, number of runs and threads

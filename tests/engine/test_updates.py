@@ -251,7 +251,7 @@ def test_only_the_states_within_the_step_limit_learn(algorithm: Any, monkeypatch
         return [each.detach().clone() for each in (*run.model.policy.parameters(), *moments)]
 
     made, half, whole = learner(0), learner(256), learner(512)
-    met = population.met_states(whole)
+    met = whole.met
     assert met is not None
     assert 0 < len(met) < 30 / 2
     nets: Any = whole.population.networks
@@ -268,8 +268,7 @@ def test_only_the_states_within_the_step_limit_learn(algorithm: Any, monkeypatch
     assert all(map(torch.equal, weights(resumed), weights(whole)))
     _, probabilities, q = whole.population.snapshot(whole)  # of all states
     assert np.abs((q if off_policy else probabilities)[unmet]).all()  # type: ignore[index]
-    monkeypatch.setattr(population, "met_states", lambda run: None)
-    monkeypatch.setattr(dqn, "met_states", lambda run: None)
+    monkeypatch.setattr(Run, "met", None)
     for mine, peer in zip(weights(whole), weights(learner(512)), strict=True):
         assert torch.allclose(mine, peer, rtol=1e-3, atol=1e-4)
 
