@@ -95,7 +95,8 @@ class DQN(Population):
             return found[index]
         if self._greedy is None:
             self._greedy = self.q_of(self.outputs).argmax(axis=-1)
-        return self._greedy[row].take(states)
+        greedy: IntArray = self._greedy[row].take(states)
+        return greedy
 
     def _count(self, step: Step, is_last: bool) -> None:
         """Count a step of each run, and call what wants to be called after it."""
@@ -202,7 +203,8 @@ class DQN(Population):
     @staticmethod
     def of_best_action(outputs: Array) -> Array:
         """What a target network's outputs say of each state's best action."""
-        return outputs.max(axis=-1)
+        best: Array = outputs.max(axis=-1)
+        return best
 
     @staticmethod
     def losses_and_slopes(

@@ -44,7 +44,8 @@ class QRDQN(DQN):
         )
         values = following.transpose(2, 0, 1, 3)
         discounts = ((1 - drawn.ends) * gamma)[:, :, None]
-        return drawn.rewards[:, :, None] + discounts * values
+        targets: Array = drawn.rewards[:, :, None] + discounts * values
+        return targets
 
     @staticmethod
     def losses_and_slopes(
@@ -78,4 +79,5 @@ def quantile_loss(quantiles: Array, targets: Array) -> tuple[float, Array]:
 
 def _weighed(level: Array, all_of_it: Array, above: Array) -> Array:
     """Sums over targets, weighed by |τ - (δ < 0)|, of the sums over all and over those above the quantile."""
-    return level * above + (1 - level) * (all_of_it - above)
+    weighed: Array = level * above + (1 - level) * (all_of_it - above)
+    return weighed

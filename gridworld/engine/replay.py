@@ -188,4 +188,5 @@ def systematic_sample(counts: IntArray, size: int, chance: FloatArray) -> IntArr
     ends = np.cumsum(counts)
     before = np.ceil(size * (ends / ends[-1]) - chance[:, None])  # points before each end
     before[:, -1] = size  # whatever was rounded
-    return np.diff(before, prepend=0).astype(np.int64)
+    counted: IntArray = np.diff(before, prepend=0).astype(np.int64)
+    return counted

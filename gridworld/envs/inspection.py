@@ -206,7 +206,7 @@ def _copies(batch: Any) -> Task:
     def masks() -> NDArray[np.bool_] | None:
         mine: Any = task.masks()
         refuse_others(lambda other: np.array_equal(mine, other.masks()), "masks actions differently from")  # type: ignore[arg-type]
-        return mine
+        return mine  # type: ignore[no-any-return]
 
     text, limit = Mdp.text(task.mdp), task.own_limit
     refuse_others(

@@ -235,7 +235,7 @@ class Wrapped:
             seen[id(wrapper)] = env
         with self._refusing("cannot be reset"):
             env.reset()
-        return env
+        return env  # type: ignore[no-any-return]
 
     @contextmanager
     def _refusing(self, what: str) -> Iterator[None]:

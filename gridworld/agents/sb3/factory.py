@@ -87,7 +87,8 @@ def algorithm_and_arguments(
 
 def algorithm_class(where: str, path: Any) -> type[BaseAlgorithm]:
     """Import a class of SB3's kind; see `import_class`."""
-    return import_class(where, path, BaseAlgorithm)
+    algorithm: type[BaseAlgorithm] = import_class(where, path, BaseAlgorithm)
+    return algorithm
 
 
 def import_class(where: str, path: Any, kind: type) -> Any:
@@ -103,7 +104,8 @@ def _policy(config: SB3Config, algorithm: type[BaseAlgorithm]) -> type[BasePolic
     if config.policy in algorithm.policy_aliases:
         return algorithm.policy_aliases[config.policy]
     if "." in config.policy:
-        return import_class("agent.policy", config.policy, BasePolicy)
+        policy: type[BasePolicy] = import_class("agent.policy", config.policy, BasePolicy)
+        return policy
     known = ", ".join(name for name in algorithm.policy_aliases if name != "MultiInputPolicy")
     raise InputError(f"agent.policy={config.policy}: {config.algorithm} has {known}")
 

@@ -81,7 +81,8 @@ def load_tensors(content: bytes) -> dict[str, Any]:
     for code, argument, _ in pickletools.genops(pickles[0]):  # which does not run it
         if code.name in _NAMING and not (code.name == "GLOBAL" and _NAMED.fullmatch(str(argument))):
             raise ValueError(f"its pickle asks for {str(argument)[:80]}, which a model may not contain")
-    return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    tensors: dict[str, Any] = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    return tensors
 
 
 def _flat(found: dict[str, Any]) -> dict[str, Tensor]:

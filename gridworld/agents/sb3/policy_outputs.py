@@ -91,7 +91,8 @@ def read_table(
 
 def explored(greedy: FloatArray, epsilon: float) -> FloatArray:
     """(S, A), the action probabilities of SB3's exploration around a greedy policy (S, A)."""
-    return (1 - epsilon) * greedy + epsilon / greedy.shape[1]
+    policy: FloatArray = (1 - epsilon) * greedy + epsilon / greedy.shape[1]
+    return policy
 
 
 def _is_actor_critic(policy: BasePolicy) -> bool:

@@ -41,7 +41,8 @@ class QLearning(TabularControl):
 
     def state_values(self, q: FloatArray) -> FloatArray:
         """max_a Q(s, a), whatever epsilon is."""
-        return q.max(axis=-1)
+        best: FloatArray = q.max(axis=-1)
+        return best
 
 
 @dataclass
@@ -62,7 +63,8 @@ class ExpectedSarsa(TabularControl):
 
     def state_values(self, q: FloatArray) -> FloatArray:
         """Σ_a π(a | s) Q(s, a) under the ε-greedy policy π of the moment."""
-        return (epsilon_greedy(q, self.exploration_rate) * q).sum(axis=-1)
+        expected: FloatArray = (epsilon_greedy(q, self.exploration_rate) * q).sum(axis=-1)
+        return expected
 
 
 @dataclass

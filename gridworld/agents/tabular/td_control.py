@@ -291,7 +291,8 @@ def update(
 def epsilon_greedy(q: FloatArray, epsilon: float) -> FloatArray:
     """π(a | s) (..., A) of values Q (..., A): with probability ε any action, else one of the best."""
     best = q == q.max(axis=-1, keepdims=True)
-    return epsilon / q.shape[-1] + (1 - epsilon) * best / best.sum(axis=-1, keepdims=True)
+    policy: FloatArray = epsilon / q.shape[-1] + (1 - epsilon) * best / best.sum(axis=-1, keepdims=True)
+    return policy
 
 
 def draw_actions(q: FloatArray, epsilon: float, states: IntArray, draws: FloatArray) -> IntArray:
