@@ -20,6 +20,7 @@ import random
 import shutil
 import struct
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +37,7 @@ from gridworld.run.provenance import identity
 from gridworld.training.tensorboard import _checksum
 
 SECRET = "the-secret-7f3a"
+_FIRST_WEIGHTS = "q_net.q_net.0.weight"
 FINE = "policy of run on"  # evaluate answers as for a good run
 Spoil = Callable[[Path, Path], object]  # (run, base)
 Content = bytes | Callable[[Path], bytes]  # of a file; the function takes base
@@ -244,8 +246,7 @@ def newest_checkpoint(run: Path, base: Path, text: Content, arrays: dict[str, by
 @spoiling
 def tensor(run: Path, base: Path, edit: Callable[[torch.Tensor], torch.Tensor]) -> None:
     """Another tensor in the place of the first weights."""
-    name = "q_net.q_net.0.weight"
-    weights(run, lambda content: content.update({name: edit(content[name])}))
+    weights(run, lambda content: content.update({_FIRST_WEIGHTS: edit(content[_FIRST_WEIGHTS])}))
 
 
 @spoiling
@@ -308,6 +309,33 @@ def pickled_array(base: Path) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, np.array([Bomb(base)], dtype=object), allow_pickle=True)
     return buffer.getvalue()
+
+
+def shared_members(base: Path) -> bytes:
+    """A zip file of 500 members that are the same bytes."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("a.pth", bytes(2**20))
+        first = archive.infolist()[0]
+        for index in range(500):
+            again = zipfile.ZipInfo(f"{index}.pth")
+            again.header_offset, again.CRC = first.header_offset, first.CRC
+            again.file_size = again.compress_size = first.file_size
+            archive.filelist.append(again)
+    return buffer.getvalue()
+
+
+def png(side: int) -> bytes:
+    """A white square whose pixels are much larger than its file."""
+    packer = zlib.compressobj(9)
+    rows = b"".join(packer.compress(bytes(1 + 3 * side)) for _ in range(side)) + packer.flush()
+    size = side.to_bytes(4, "big") * 2 + bytes([8, 2, 0, 0, 0])
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        checksum = zlib.crc32(name + content).to_bytes(4, "big")
+        return len(content).to_bytes(4, "big") + name + content + checksum
+
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", size) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
 def event(content: bytes, length: int | None = None) -> bytes:
@@ -416,6 +444,10 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
      tensor(lambda there: there.to_sparse())),
     ("a_tensor_of_a_trillion_numbers", "it must be float32",
      tensor(lambda _: torch.zeros(1).expand(_TRILLION))),
+    ("zip_whose_members_share_their_bytes", "members are larger than the file",
+     file("model.zip", shared_members)),
+    ("weights_left_out", "is missing",
+     lambda run, base: weights(run, lambda content: content.pop(_FIRST_WEIGHTS))),
     ("weights_that_are_no_numbers", "contains numbers that are not finite",
      tensor(lambda there: there.fill_(float("nan")))),
     ("exploration_beyond_all_bounds", "exploration_rate=7.0: must be from 0 to 1",
@@ -514,6 +546,8 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
     ("curve_that_waits_for_a_writer", FINE, waiting("curve.csv")),
     ("summary_that_is_the_secret", FINE, linked("summary.json", "{base}/secret.json")),
     ("picture_that_is_the_secret", FINE, linked("policy.png", "{base}/secret.png")),
+    ("picture_of_eighty_million_pixels", FINE,
+     lambda run, base: (run / "policy.png").write_bytes(png(9_000))),
     ("films_that_are_the_secret", FINE,
      all_of(linked("episode.gif", "{base}/secret.png"), linked("episode.mp4", "/dev/zero"))),
     ("event_of_an_exabyte", FINE, events(lambda: event(b"x", 2**60))),

@@ -1,4 +1,4 @@
-"""PPO, A2C and DQN with one bug each, as implementations have them.
+"""PPO, A2C, DQN and QR-DQN with one bug each, as implementations have them.
 
 Each call below makes a class of this module: its name, what is wrong with it, the probes that it must fail
 (the first is its own), and the methods that are changed, of the algorithm, of its buffer or of its policy.
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from sb3_contrib import QRDQN
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -216,7 +217,7 @@ for _name, _base, _what, _factor in (
 ):
     _bug(_name, _base, _what, "entropy", train=_bonus_times(_factor))
 
-# ---- DQN ----------------------------------------------------------------------------------------
+# ---- DQN and QR-DQN -----------------------------------------------------------------------------
 
 _bug(
     "NoTargetNetwork", DQN, "The targets are computed with the network that learns.", "target",
@@ -266,6 +267,10 @@ _bug(
     "Epsilon falls with the calls of `step`, not with the steps of all environments.", "behaviour",
     _on_step=_during(
         _current_progress_remaining=lambda m: 1 - (1 - m._current_progress_remaining) / m.n_envs),
+)
+_bug(
+    "QRDQNEpsilonNeverFalls", QRDQN, "It explores as much at the end as at the beginning.", "behaviour",
+    _on_step=_after(exploration_rate=lambda m: m.exploration_initial_eps),
 )
 _bug(
     "DQNFrozenLayer", DQN, "The last layer has no gradient.", "layers",
