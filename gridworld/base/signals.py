@@ -73,8 +73,9 @@ def exiting(*numbers: signal.Signals, first: Callable[[int], object] = int) -> I
 @contextmanager
 def blocking(*numbers: signal.Signals) -> Iterator[None]:
     """Deliver these signals to this thread only after the block; a process started in it never gets them."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     try:
+        signal.pthread_sigmask(signal.SIG_BLOCK, numbers)  # calls the handler of one that came just before
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import platform
+import signal
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from typing import Any
 
 from gridworld.base.errors import DISTRIBUTION
 from gridworld.base.safe_read import sha256
+from gridworld.base.signals import blocking
 from gridworld.config.fields import Effect
 from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import AgentConfig, TrainConfig
@@ -138,7 +140,11 @@ def source_of(tree: Path) -> Source | None:
     def ask(*words: str, **variables: str) -> bytes:
         environment = {**os.environ, **variables, "GIT_OPTIONAL_LOCKS": "0"}
         command = ["git", "-C", str(tree), *words]
-        done = subprocess.run(command, capture_output=True, check=True, timeout=_GIT_SECONDS, env=environment)
+        # A handler that raises between two steps of `run` would leave a lock taken that `run` itself waits for.
+        with blocking(signal.SIGINT, signal.SIGTERM):
+            done = subprocess.run(
+                command, capture_output=True, check=True, timeout=_GIT_SECONDS, env=environment
+            )
         return done.stdout
 
     try:

@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import shutil
+import signal
 import subprocess
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from helpers.resuming import go_on, stopped_after
 from helpers.support import ROOT, SHORT, script, train_in
 
 from gridworld.base.errors import InputError
+from gridworld.base.signals import exiting
 from gridworld.commands import reproduce as command
 from gridworld.commands.reproduce import main
 from gridworld.run.folder import SOURCE_DIFF
@@ -277,6 +279,23 @@ def test_changes_since_the_commit_are_kept_and_can_be_applied(tmp_path: Path) ->
     status = subprocess.run(["git", "-C", str(tree), "status", "--porcelain"], capture_output=True, text=True)
     assert status.stdout.splitlines() == [" M gridworld/a.py", " M notes.txt", "?? gridworld/new.py"]
     assert source_of(tmp_path) is None
+
+
+def test_a_signal_waits_until_git_has_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A handler that raised in the middle of a call of git could leave a lock of `subprocess` taken for ever."""
+    (tmp_path / ".git").mkdir()
+    fake = tmp_path / "git"
+    fake.write_text(f"#!/bin/sh\nkill -TERM $PPID\nsleep 0.2\ntouch answered\n")
+    fake.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    had_answered = []
+    with (
+        pytest.raises(SystemExit),
+        exiting(signal.SIGTERM, first=lambda _: had_answered.append(Path("answered").exists())),
+    ):
+        source_of(tmp_path)
+    assert had_answered == [True]
 
 
 def test_a_damaged_event_file_is_named(run: Path, tmp_path: Path) -> None:
