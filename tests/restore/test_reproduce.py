@@ -285,7 +285,7 @@ def test_a_signal_waits_until_git_has_answered(tmp_path: Path, monkeypatch: pyte
     """A handler that raised in the middle of a call of git could leave a lock of `subprocess` taken for ever."""
     (tmp_path / ".git").mkdir()
     fake = tmp_path / "git"
-    fake.write_text(f"#!/bin/sh\nkill -TERM $PPID\nsleep 0.2\ntouch answered\n")
+    fake.write_text("#!/bin/sh\nkill -TERM $PPID\nsleep 0.2\ntouch answered\n")
     fake.chmod(0o755)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
