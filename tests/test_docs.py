@@ -70,6 +70,7 @@ TURNS = {
     r"in the place of": "instead of",
     r"gives? up": "cancel, abandon",
     r"(?<!there )is no (?!longer)\w+": "is not a",
+    r"\w*learnt": "learned",
 }
 
 
@@ -80,7 +81,16 @@ def unusual(text: str) -> dict[str, str]:
 
 def test_pages_messages_and_help_use_the_usual_words() -> None:
     """All strings of the package with a space, except docstrings; a command's docstring is its help."""
-    found = {page.stem: turns for page in PAGES if (turns := unusual(page.read_text("utf-8")))}
+    whole = [
+        *PAGES,
+        *(path for name in ("docs", "scripts") for path in (ROOT / name).rglob("*.py")),
+        *(ROOT / "docs").rglob("*.ipynb"),
+        *(ROOT / "conf").rglob("*.yaml"),
+        *(ROOT / "gridworld").rglob("*.j2"),
+        *(ROOT / name for name in ("docs/CITATION.cff", "docs/benchmarks/rl_zoo.yml", "pyproject.toml")),
+    ]
+    texts = {str(path.relative_to(ROOT)): path.read_text("utf-8") for path in whole}
+    found = {name: turns for name, text in texts.items() if (turns := unusual(text))}
     for path in sorted((ROOT / "gridworld").rglob("*.py")):
         tree = ast.parse(path.read_text("utf-8"))
         docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
@@ -90,9 +100,6 @@ def test_pages_messages_and_help_use_the_usual_words() -> None:
             text = node.value if isinstance(node, ast.Constant) and id(node) not in docstrings else ""
             if isinstance(text, str) and " " in text and (turns := unusual(text)):
                 found[f"{path.relative_to(ROOT)}:{node.lineno}"] = turns
-    for path in sorted((ROOT / "conf").rglob("*.yaml")):
-        if turns := unusual(path.read_text("utf-8")):
-            found[str(path.relative_to(ROOT))] = turns
     assert not found
 
 
