@@ -2,14 +2,12 @@
 
 import ast
 import dataclasses
-import importlib.util
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from helpers.pages import PAGES, Reader, blocks, check
+from helpers.pages import PAGES, Reader, blocks, check, module_of
 from helpers.support import ROOT, configure
 
 import gridworld
@@ -84,12 +82,12 @@ def test_pages_messages_and_help_use_the_usual_words() -> None:
     whole = [
         *PAGES,
         *(path for name in ("docs", "scripts") for path in (ROOT / name).rglob("*.py")),
-        *(ROOT / "docs").rglob("*.ipynb"),
         *(ROOT / "conf").rglob("*.yaml"),
         *(ROOT / "gridworld").rglob("*.j2"),
         *(ROOT / name for name in ("docs/CITATION.cff", "docs/benchmarks/rl_zoo.yml", "pyproject.toml")),
     ]
     texts = {str(path.relative_to(ROOT)): path.read_text("utf-8") for path in whole}
+    texts["the notebook"] = re.sub(r"base64,[^)\"]+", "", module_of("notebook").page())
     found = {name: turns for name, text in texts.items() if (turns := unusual(text))}
     for path in sorted((ROOT / "gridworld").rglob("*.py")):
         tree = ast.parse(path.read_text("utf-8"))
@@ -104,7 +102,7 @@ def test_pages_messages_and_help_use_the_usual_words() -> None:
 
 
 def test_the_pictures_are_the_ones_that_a_command_draws() -> None:
-    figures = _module("figures")
+    figures = module_of("figures")
     assert {path.name for path in figures.IMAGES.iterdir()} == set(figures.SOURCES)
     assert sum(path.stat().st_size for path in figures.IMAGES.iterdir()) < 400_000
     for line in figures.COMMANDS.splitlines():
@@ -113,7 +111,7 @@ def test_the_pictures_are_the_ones_that_a_command_draws() -> None:
 
 def test_the_tables_of_options_are_complete() -> None:
     """Every setting, option and argument has a row, and every row says what it is for."""
-    tables = _module("option_tables")
+    tables = module_of("option_tables")
     page = (ROOT / "docs" / "reference" / "options.md").read_text("utf-8")
     assert set(re.findall(r"<!-- table: (\w+) -->", page)) == set(tables.TABLES)
     filled = tables.fill(page)
@@ -134,12 +132,3 @@ def test_the_tables_of_options_are_complete() -> None:
 def test_the_api_reference_has_every_public_name() -> None:
     page = (ROOT / "docs" / "reference" / "api.md").read_text("utf-8")
     assert set(re.findall(r"gridworld\.(\w+)\b", page)) >= set(gridworld.__all__)
-
-
-def _module(name: str) -> Any:
-    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
