@@ -57,7 +57,7 @@ def test_the_notebook_shows_what_is_stored_in_it(tmp_path: Path, monkeypatch: py
 
 
 def _shown(notebook: Any) -> list[tuple[str, list[Any]]]:
-    """Of each output its text, without numbers, which a processor may change, and its pictures, made small."""
+    """Of each output its text without numbers, which a processor may change, and its pictures, made small."""
     found = []
     for cell in notebook.cells:
         for output in cell.get("outputs", []):
