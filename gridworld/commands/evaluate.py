@@ -66,8 +66,6 @@ def _parser() -> argparse.ArgumentParser:
 
 def _table(evaluator: Evaluator, policy: FloatArray, score: Score, sampled: SampledScores) -> str:
     """Exact scores, the optimum, and sampled scores of the same horizon; if narrow, intervals."""
-    is_narrow = shutil.get_terminal_size().columns < 68
-    sampled_title = "sampled [95 %]" if is_narrow else f"{sampled.episodes:,} episodes [95 %]"
     best = optimal_score(evaluator)
     estimates = {
         "goal_probability": sampled.goal,
@@ -78,7 +76,7 @@ def _table(evaluator: Evaluator, policy: FloatArray, score: Score, sampled: Samp
     }
     discounted = [f"{evaluator.discounted_return(each):.4g}" for each in (policy, evaluator.optimal_policy())]
     rows = [
-        ["", "exact", "optimum", sampled_title],
+        ["", "exact", "optimum", f"{sampled.episodes:,} episodes [95 %]"],
         ["without a step limit:", "", "", ""],
         ["value", f"{score.value:.4g}", f"{evaluator.optimal_value:.4g}", ""],
         [f"within {evaluator.max_episode_steps:,} steps:", "", "", ""],
@@ -88,8 +86,10 @@ def _table(evaluator: Evaluator, policy: FloatArray, score: Score, sampled: Samp
         if metric.within_limit:
             exact, optimum = (metric.text(metric.of(each)) for each in (score, best))
             rows.append([metric.label, exact, optimum, str(estimates.get(metric.name, ""))])
-    if is_narrow:
-        rows[1:] = [[*row[:3], row[3].partition(" ")[2]] for row in rows[1:]]
+    is_narrow = shutil.get_terminal_size().columns < 70
+    for row in rows:
+        row[3] = row[3][row[3].find("[") :] if is_narrow else f" {row[3]}"
+    rows[0][3] = "sampled [95 %]" if is_narrow else rows[0][3]
     return "\n".join(f"  {line}" for line in aligned(rows, ("<20", ">8", ">8", "<0")))
 
 
