@@ -8,10 +8,9 @@ import importlib
 import json
 import multiprocessing
 import os
-import select
 import signal
 import subprocess
-import time
+import threading
 from dataclasses import dataclass, field
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection
@@ -105,14 +104,12 @@ class Started:
 
     def communicate(self, timeout: float) -> tuple[None, str]:
         """What is left of its standard error, which its children may hold too, once it has ended."""
-        end, told = time.monotonic() + timeout, b""
-        while select.select([self.stderr], [], [], max(0.0, end - time.monotonic()))[0]:
-            part = os.read(self.stderr.fileno(), 2**16)
-            if not part:
-                self.wait(max(1.0, end - time.monotonic()))
-                return None, told.decode()
-            told += part
-        raise subprocess.TimeoutExpired(str(self.pid), timeout, stderr=told)
+        killer = threading.Timer(timeout, os.killpg, (self.pid, signal.SIGKILL))
+        killer.start()
+        told = self.stderr.read()
+        killer.cancel()
+        self.wait(timeout)
+        return None, told
 
     def send_signal(self, number: int) -> None:
         """Send a signal, unless it has ended."""
