@@ -53,9 +53,7 @@ def run(
     """Run one of the scripts in `cwd`, which prints to the file `stdout`, or to what comes back.
 
     With `secret` it may write to `cwd` and nowhere else, and whoever opens a file of that name is noted.
-
-    Raises:
-        subprocess.TimeoutExpired: It took longer than `timeout` seconds, and was killed.
+    Where it takes longer than `timeout` seconds it is killed, and `subprocess.TimeoutExpired` raised.
     """
     with TemporaryDirectory(prefix="forks-") as place:
         out, err, report = stdout or Path(place) / "out", Path(place) / "err", Path(place) / "report"
@@ -92,7 +90,7 @@ class Started:
         return self._process.exitcode
 
     def poll(self) -> int | None:
-        """The same."""
+        """The same, as `subprocess.Popen` has it."""
         return self.returncode
 
     def wait(self, timeout: float) -> int:

@@ -24,7 +24,6 @@ from gridworld.sweeps.folder import SweepFolder
 QUICK = ("agent=q_learning", "total_timesteps=500", *NO_PICTURES)
 FOLDER = "hydra.sweep.dir=sweep"
 WORKERS = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
-FORKS = ("hydra/launcher=forks", "hydra.launcher.n_jobs=2")
 OWN_CLASSES = """
 import os, signal
 from stable_baselines3 import A2C
@@ -195,27 +194,10 @@ def curve_begun(path: Path) -> bool:
     return path.read_text().count("\n") > 2
 
 
-def wait_for_a_job(folder: Path) -> None:
-    wait_for(lambda: any(curve_begun(path) for path in folder.glob("sweep/*/curve.csv")), "a job")
-
-
-@pytest.mark.parametrize("workers", [FORKS, WORKERS])
-def test_workers_do_not_outlive_a_killed_sweep(workers: tuple[str, ...], tmp_path: Path) -> None:
-    endless = ("-m", *QUICK, "total_timesteps=100000000", FOLDER, "seed=0,1,2")
-    with start("train.py", *endless, *workers, cwd=tmp_path) as process:
-        wait_for_a_job(tmp_path)
-        process.kill()
-    wait_for(lambda: not members(process.pid), "the workers' end")
-    looked = script("jobs.py", "sweep", cwd=tmp_path)
-    assert looked.returncode == 0
-    assert looked.stdout.splitlines()[-1].startswith("3 jobs: ")
-    assert set(statuses(tmp_path / "sweep").values()) <= {"interrupted", "pending"}
-
-
 def test_a_fork_that_is_killed_takes_no_other_job_along(tmp_path: Path) -> None:
-    words = ["-m", *QUICK, "seed=range(3)", "total_timesteps=20000", FOLDER, *FORKS]
-    with start("train.py", *words, cwd=tmp_path) as process:
-        wait_for_a_job(tmp_path)
+    words = ["-m", *QUICK, "seed=range(3)", "total_timesteps=20000", FOLDER, "hydra/launcher=forks"]
+    with start("train.py", *words, "hydra.launcher.n_jobs=2", cwd=tmp_path) as process:
+        wait_for(lambda: any(map(curve_begun, tmp_path.glob("sweep/*/curve.csv"))), "a job")
         os.kill(max(int(each) for each in members(process.pid)), signal.SIGKILL)
         _, errors = process.communicate(timeout=180)
     assert process.returncode == 0, errors
@@ -307,14 +289,3 @@ def test_a_run_that_is_there_is_not_taken_for_another_job(swept: Path) -> None:
     assert "seed=2" not in statuses(folder)
     assert list(statuses(folder).values()) == ["done", "pending", "done"]
     assert (folder / "seed=2" / "manifest.json").read_bytes() == before
-
-
-def test_a_table_that_was_damaged_or_lost_is_made_again(swept: Path) -> None:
-    file = swept / "sweep" / "jobs.csv"
-    before = file.read_text()
-    for damage in ("nonsense\n", before.replace("done", "running"), None):
-        file.unlink()
-        if damage is not None:
-            file.write_text(damage)
-        jobs_command.main([str(swept / "sweep")])
-        assert file.read_text() == before

@@ -41,13 +41,14 @@ def progress(sweep: Path) -> int:
 
 
 def check_what_is_left(sweep: Path, before: dict[str, bytes]) -> dict[str, bytes]:
-    """The table is right, and what was done is as it was; returns what is done now."""
+    """No worker is left, the table is right, and what was done is as it was; returns what is done now."""
     if not (sweep / "sweep.json").exists():
         return before
     end = time.monotonic() + 180
     while any(is_locked(path) for path in sweep.glob("*/.lock")):
         assert time.monotonic() < end, "a worker outlives its sweep"
         time.sleep(0.05)
+    (sweep / "jobs.csv").write_text("nonsense\n")  # it is made again
     jobs_command.main([str(sweep)])
     done = {}
     for job, row in rows(sweep).items():
