@@ -155,10 +155,9 @@ POINTS: list[tuple[Any, str, bool, int]] = [
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_at_a_point_ends_as_if_it_was_not(tmp_path: Path) -> None:
-    words = RUNS["dqn"]
+    words, folder = RUNS["q_learning"], tmp_path / "run"
     begin(tmp_path / "calm", *words)
     calm = left_behind(tmp_path / "calm")
-    folder = tmp_path / "run"
     for turn in range(ROUNDS):
         for owner, name, after, number in POINTS:
             at = max(1, number - turn)  # an earlier call in every round; later ones need not come
