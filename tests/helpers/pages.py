@@ -100,14 +100,10 @@ def _replaced(words: list[str], others: list[str]) -> list[str]:
 
 
 class Reader:
-    """Goes through pages in one folder, which looks like the repository from the inside.
+    """Goes through pages in one empty folder, which looks like the repository from the inside.
 
-    A line that was run in it before is not run again: a page may repeat what another has.
-
-    Args:
-        folder: an empty one.
-        claims: by a part of a command line: what it prints, and the words that are added to it; it is not
-            shortened otherwise.
+    A line that was run in it before is not run again: a page may repeat what another has. `claims` has, by a
+    part of a command line, what it prints and the words that are added to it; it is not shortened otherwise.
     """
 
     def __init__(self, folder: Path, claims: Mapping[str, tuple[str, list[str]]]) -> None:
