@@ -112,7 +112,7 @@ def test_the_librarys_own_curves_have_tens_of_points() -> None:
     for recipe, (env, agent) in PAIRS.items():
         on_policy = re.fullmatch("(a2c|ppo|trpo)(_sb3_defaults)?", agent)
         if on_policy and (recipe in RECIPES or env == "classic"):
-            config = configure(f"experiment={recipe}")
+            config = configure(f"env={env}", f"agent={agent}")
             algorithm, arguments = algorithm_and_arguments(config.agent)
             default = inspect.signature(algorithm.__init__).parameters["n_steps"].default
             iterations = config.total_timesteps // (arguments.get("n_steps", default) * config.n_envs)
