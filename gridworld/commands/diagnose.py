@@ -41,8 +41,8 @@ def main(arguments: Sequence[str]) -> None:
         print(_table(found))
     print(printable(found.sentence()))
     if found.commands:
-        print("Try, one at a time:")
-        print(*(printable(f"  {line}") for line in found.commands), sep="\n")
+        lines = ["Try, one at a time:", *(f"  {line}" for line in found.commands)]
+        print(*map(printable, [saved.omission] if saved.omission else lines), sep="\n")
         path = options.run / PICTURE
         try:
             check_no_link(path)

@@ -171,6 +171,8 @@ def trials_folder(folder: Path) -> Path:
 
 def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool, offer: TrainConfig | None = None) -> None:
     """Check that to compose and train the offers, or this one, runs no code of a stranger's choice."""
+    if found.offers and saved.omission:
+        raise InputError(saved.omission)
     if found.offers and not trust:
         config = saved.config if offer is None else offer
         built = {"agent": dataclasses.asdict(config.agent), "callbacks": config.callbacks}

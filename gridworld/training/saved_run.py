@@ -11,17 +11,19 @@ from __future__ import annotations
 import dataclasses
 import io
 import math
+import os
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot
-from gridworld.base.console import tell
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import DAMAGED, limited
 from gridworld.config.settings import check_foreign, read_config
 from gridworld.config.train import TrainConfig, check
+from gridworld.config.words import own_conf_folders
 from gridworld.config.worlds import MapConfig
 from gridworld.run.folder import shown
 from gridworld.run.reader import RunReader, open_run, stored_world
@@ -51,22 +53,29 @@ class SavedRun:
         self.config = dataclasses.replace(settings_of(self.run, trust, trains=False), device="cpu")
         self.mdp: Mdp = stored_world(self.run, self.config.env)
         self._trust = trust
+        self.omission = ""  # a sentence on what `overrides` leaves out
 
-    @property
+    @cached_property
     def overrides(self) -> list[str]:
-        """The words of its command line, as they may be given again.
+        """The words of its command line, as they may be given again from here, with its `--config-dir`.
 
-        Of a run that is not trusted they are made of its settings, and what would run code is left out.
+        Of a run that is not trusted they are made of its settings, and what may run code is left out.
         """
         # here, with Hydra, which takes its time
-        from gridworld.config.recipe_file import harmless_words
+        from gridworld.config.recipe_file import path_from_here, words_again
 
-        words: list[str] = self.run.manifest.get("overrides") or []
-        kept = list(words) if self._trust else list(harmless_words(words, self.config))
-        if left_out := len(words) - len(kept):
-            tell(
-                f"{shown(self.run.folder)}: {left_out} of the {len(words)} words of its command line may "
-                "run code or leave its folder, and are omitted; open the run with trust to keep them"
+        manifest = self.run.manifest
+        place = manifest.get("called_from")
+        called_from = None if place is None else Path(os.path.realpath(self.run.folder), place)
+        given = manifest.get("overrides") or []
+        words = [word for word in given if not word.startswith("--")]
+        folders = dict.fromkeys(own_conf_folders([*manifest.get("command", []), *given]))
+        kept = [f"--config-dir={path_from_here(str(each), called_from)}" for each in folders if self._trust]
+        kept += words_again(words, self.config, called_from, self._trust)
+        if not self._trust and len(kept) < len(words) + len(folders):
+            self.omission = (
+                f"{shown(self.run.folder)}: its command line may run code or read files outside this folder; "
+                "diagnose it with --trust (trust=True) to see what to try"
             )
         return kept
 

@@ -145,7 +145,7 @@ def test_settings_are_those_of_the_command_line() -> None:
     ("given", "sentence"),
     [
         (("agent=dnq",), "agent=dnq: no such choice; choose from"),
-        (("agent.lr=3",), "no such setting in DQNConfig; did you mean learning_rate?"),
+        (("agent.lr=3",), "no such setting of DQN; did you mean learning_rate?"),
         (({"agent.gama": 0.9},), "did you mean gamma?"),
         (("seed=1,2",), "seed=1,2: has several values; call gridworld.sweep with them"),
         (("-m",), "-m: is not an override; write KEY=VALUE"),

@@ -95,14 +95,14 @@ def test_options_have_dashes() -> None:
     [
         ("agent=dnq", "agent=dnq: no such choice; choose from a2c, .*; did you mean dqn\\?"),
         ("env=mazes", "did you mean maze\\?"),
-        ("agent.lr=1", "agent.lr: no such setting in DQNConfig; did you mean learning_rate?"),
+        ("agent.lr=1", "agent.lr: no such setting of DQN; did you mean learning_rate?"),
         ("agnet=dqn", "did you mean agent\\?"),
         ("evaluation.evry=1", "did you mean every\\?"),
         ("experimnt=maze_dqn", "did you mean experiment\\?"),
-        ("learning_rate=1", "no such setting in TrainConfig; did you mean agent.learning_rate\\?"),
+        ("learning_rate=1", "no such setting; did you mean agent.learning_rate\\?"),
         ("gama=1", "did you mean agent.gamma or evaluation.gamma\\?"),
         ("agent.slip=1", "did you mean env.slip\\?"),
-        ("agent=ppo agent.buffer_size=1", "no such setting in PPOConfig; --cfg job shows all keys"),
+        ("agent=ppo agent.buffer_size=1", "no such setting of PPO; --cfg job shows all keys"),
         ("+agent=ppo", "\\+agent=ppo: agent is always chosen, .*; write agent=ppo$"),
     ],
 )
