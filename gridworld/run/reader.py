@@ -119,9 +119,8 @@ def open_run(folder: Path) -> RunReader:
     """Read a finished run."""
     run = read_run(folder)
     if not run.is_finished:
-        raise InputError(
-            f"{folder}: this run is {run.manifest['status']!r}; only finished runs can be opened"
-        )
+        what = f"this run is {run.manifest['status']!r}, not finished; resume it with  {run.resume_command()}"
+        raise InputError(f"{folder}: {what}")
     return run
 
 

@@ -53,31 +53,37 @@ class SavedRun:
         self.config = dataclasses.replace(settings_of(self.run, trust, trains=False), device="cpu")
         self.mdp: Mdp = stored_world(self.run, self.config.env)
         self._trust = trust
-        self.omission = ""  # a sentence on what `overrides` leaves out
 
-    @cached_property
+    @property
     def overrides(self) -> list[str]:
         """The words of its command line, as they may be given again from here, with its `--config-dir`.
 
         Of a run that is not trusted they are made of its settings, and what may run code is left out.
         """
+        return self._words[0]
+
+    @property
+    def omission(self) -> str:
+        """A sentence on what `overrides` leaves out; "" for nothing."""
+        what = f"{shown(self.run.folder)}: its command line may run code or read files outside this folder; "
+        return f"{what}diagnose it with --trust (trust=True) to see what to try" if self._words[1] else ""
+
+    @cached_property
+    def _words(self) -> tuple[list[str], bool]:
+        """The `overrides`, and whether any are left out."""
         # here, with Hydra, which takes its time
         from gridworld.config.recipe_file import path_from_here, words_again
 
-        manifest = self.run.manifest
+        manifest, trust = self.run.manifest, self._trust
         place = manifest.get("called_from")
         called_from = None if place is None else Path(os.path.realpath(self.run.folder), place)
-        given = manifest.get("overrides") or []
+        line, given = manifest.get("command", []), manifest.get("overrides") or []
         words = [word for word in given if not word.startswith("--")]
-        folders = dict.fromkeys(own_conf_folders([*manifest.get("command", []), *given]))
-        kept = [f"--config-dir={path_from_here(str(each), called_from)}" for each in folders if self._trust]
-        kept += words_again(words, self.config, called_from, self._trust)
-        if not self._trust and len(kept) < len(words) + len(folders):
-            self.omission = (
-                f"{shown(self.run.folder)}: its command line may run code or read files outside this folder; "
-                "diagnose it with --trust (trust=True) to see what to try"
-            )
-        return kept
+        words += [word for word in line if word.startswith("hydra.searchpath=") and word not in given]
+        folders = dict.fromkeys(own_conf_folders([*line, *given]))
+        own = [f"--config-dir={path_from_here(str(each), called_from)}" for each in folders if trust]
+        kept = [*own, *words_again(words, self.config, called_from, trust)]
+        return kept, not trust and len(kept) < len(words) + len(folders)
 
     @limited()
     def evaluator(self, layout: str | None = None) -> Evaluator:

@@ -351,5 +351,5 @@ def test_scripts_listen_before_what_takes_time_to_import() -> None:
 )
 def test_only_settings_that_name_code_have_to_be_trusted(agent: dict[str, object], more: str) -> None:
     run = RunFolder(Path("runs/it"))
-    assert run.resume_command({"agent": agent}) == f"python scripts/train.py resume=runs/it{more}"
-    assert run.resume_command() == "python scripts/train.py resume=runs/it"
+    assert run.resume_command({"agent": agent}) == f"gridworld train resume=runs/it{more}"
+    assert run.resume_command() == "gridworld train resume=runs/it"
