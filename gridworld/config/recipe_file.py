@@ -71,6 +71,8 @@ def _file(word: str) -> Path:
         raise InputError(f"{word}: no such file; must be a recipe's yaml, or the folder of a study")
     if not path.is_dir():
         return path
+    if not os.path.lexists(path / IN_A_STUDY[0]):
+        raise InputError(f"{word}: is not the folder of a study, it has no {'/'.join(IN_A_STUDY)}")
     if (path / IN_A_STUDY[0]).is_symlink():
         raise InputError(f"{path / IN_A_STUDY[0]}: is a symbolic link, which is not followed out of a study")
     return path.joinpath(*IN_A_STUDY)

@@ -220,6 +220,8 @@ def _unknown_choice(message: str) -> str:
     assert missing is not None
     choices = group.group(2).split() if group else []
     where, _, name = missing.group(1).rpartition("/")
+    if group and missing.group(1).startswith(f"{group.group(1)}/"):
+        where, name = group.group(1), missing.group(1)[len(group.group(1)) + 1 :]
     if where == "experiment":
         choices = sorted({*choices, *pairs()})
     fact = f"{where}={name}: no such choice"
