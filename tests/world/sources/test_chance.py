@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.envs.toy_text import blackjack
+from helpers.support import configure
 
 from gridworld.base.errors import InputError
 from gridworld.config.worlds import GymnasiumConfig
+from gridworld.training.setup import notes
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
+from gridworld.world.memoryless import cost_of_own_observation
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.sources.enumerated import enumerate_env
 from gridworld.world.sources.gymnasium_table import compile_gymnasium
@@ -331,6 +334,10 @@ def test_an_observation_of_several_beliefs_is_said(compiled: Any) -> None:
     by_observation = np.eye(2)[np.where(mdp.own_observation == 2, 1, 0)]
     score = judge.score(by_observation)
     assert (score.value, score.certified) == (0.5, False)
+    assert cost_of_own_observation(mdp, 1.0) == 0.5
+    config = configure("env=enumerated", "env.id=Delayed-v0", "agent=dqn", "observation=own")
+    note = "1 observations stand for several states; a policy that sees no more has a regret of at least 0.49"
+    assert any(note in each for each in notes(config, mdp))
 
 
 class Coin(World):
