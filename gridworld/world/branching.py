@@ -23,12 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError
+from gridworld.world import uniform
 from gridworld.world.mdp import IntArray
+from gridworld.world.uniform import MOST_OUTCOMES, Uniform
 
 Result = TypeVar("Result")
 Weights = tuple[Fraction, ...]
 
-_MOST_OUTCOMES = 10_000  # of one draw
 _MOST_DRAWS = 500  # of one step; a loop that rejects what it draws may have any number
 MOST_BRANCHES = 100_000  # of one step
 _UNLIKE = (
@@ -139,7 +140,7 @@ class Branching:
     def _not_repeatable(self) -> InputError:
         return InputError(
             f"{self._where}: a step that is repeated from a copy of its state draws otherwise, so it "
-            "depends on what is no state"
+            "depends on more than its state"
         )
 
     def refuse(self, what: str, remedy: str = _UNLIKE, drawn: str | None = None) -> NoReturn:
@@ -150,9 +151,9 @@ class Branching:
 
     @staticmethod
     def line() -> str:
-        """The file and line that called into this module."""
+        """The file and line that called into this module, or compared one of its numbers."""
         frame = sys._getframe(1)
-        while frame.f_back is not None and frame.f_code.co_filename == __file__:
+        while frame.f_back is not None and frame.f_code.co_filename in (__file__, uniform.__file__):
             frame = frame.f_back
         return f"{frame.f_code.co_filename}:{frame.f_lineno}"
 
@@ -162,8 +163,8 @@ class Branching:
             getattr(self._real, name)(*arguments)
 
     def _one_of(self, count: int) -> int:
-        if count > _MOST_OUTCOMES:
-            self.refuse(f"a draw has {count:,} outcomes, more than {_MOST_OUTCOMES:,}")
+        if count > MOST_OUTCOMES:
+            self.refuse(f"a draw has {count:,} outcomes, more than {MOST_OUTCOMES:,}")
         return self.decide(_even(count))
 
     def __getattr__(self, name: str) -> Any:
@@ -233,8 +234,8 @@ class Branching:
             pool = np.arange(int(pool))
         elif p is None and size is None and pool.ndim == 1 and pool.dtype.kind in "biufUS":
             values, weights = _distinct(pool.dtype.str, pool.tobytes())
-            if len(values) > _MOST_OUTCOMES:
-                self.refuse(f"a choice has {len(values):,} outcomes, more than {_MOST_OUTCOMES:,}")
+            if len(values) > MOST_OUTCOMES:
+                self.refuse(f"a choice has {len(values):,} outcomes, more than {MOST_OUTCOMES:,}")
             number = self.decide(weights)
             if type(a) is list and self._place > place:
                 self._decisions[place].pool, self._decisions[place].values = list(a), values
@@ -254,8 +255,8 @@ class Branching:
         return pool[chosen] if size is None and pool.ndim == 1 else pool.take(chosen, axis=axis)
 
     def _among(self, weights: Weights) -> int:
-        if len(weights) > _MOST_OUTCOMES:
-            self.refuse(f"a choice has {len(weights):,} outcomes, more than {_MOST_OUTCOMES:,}")
+        if len(weights) > MOST_OUTCOMES:
+            self.refuse(f"a choice has {len(weights):,} outcomes, more than {MOST_OUTCOMES:,}")
         return self.decide(weights)
 
     def _in_turn(self, weights: Weights, count: int) -> list[int]:
@@ -287,8 +288,8 @@ class Branching:
         if np.ndim(n) or np.ndim(p):
             self.refuse("binomial() with arrays cannot be enumerated")
         self._check("binomial", n, p, size)
-        if n >= _MOST_OUTCOMES:
-            self.refuse(f"a draw has {int(n):,} outcomes, more than {_MOST_OUTCOMES:,}")
+        if n >= MOST_OUTCOMES:
+            self.refuse(f"a draw has {int(n):,} outcomes, more than {MOST_OUTCOMES:,}")
         weights = _binomial(int(n), Fraction(float(p)))
         number = _many(size, np.int64, lambda: self.decide(weights))
         return int(number) if size is None else number
@@ -312,139 +313,6 @@ class Branching:
         if size is None:
             return counts()
         return np.array([counts() for _ in range(math.prod(_shape(size)))]).reshape(*_shape(size), -1)
-
-
-class Uniform:
-    """`scale` * u + `offset`, where all that is known of u is the interval of [0, 1) that it is in."""
-
-    __slots__ = ("_branching", "_drawn", "_interval", "_offset", "_run", "_scale")
-
-    def __init__(
-        self,
-        branching: Branching,
-        drawn: str,
-        interval: list[Fraction],
-        scale: Fraction,
-        offset: Fraction,
-    ) -> None:
-        self._branching, self._run, self._drawn = branching, branching.run, drawn
-        self._interval, self._scale, self._offset = interval, scale, offset
-
-    def _refuse(self, *_: Any, **__: Any) -> Any:
-        self._branching.refuse(
-            "a random number is used otherwise than in a comparison with a threshold", drawn=self._drawn
-        )
-
-    __float__ = __bool__ = __complex__ = __index__ = __round__ = __hash__ = __str__ = __repr__ = _refuse
-    __eq__ = __ne__ = __abs__ = __pow__ = __rpow__ = __mod__ = __rmod__ = __floordiv__ = _refuse
-    __rfloordiv__ = __divmod__ = __rdivmod__ = __rtruediv__ = __ceil__ = __format__ = _refuse
-    __reduce_ex__ = _refuse
-
-    def _among(self, cuts: Sequence[Fraction]) -> Fraction:
-        """Split the interval at the cuts that are in it; returns where the part begins that u is in."""
-        if self._run != self._branching.run:
-            self._branching.refuse("a random number is kept beyond its step", drawn=self._drawn)
-        low, high = self._interval
-        edges = [low, *sorted({cut for cut in cuts if low < cut < high}), high]
-        if len(edges) > 2:
-            if len(edges) > _MOST_OUTCOMES:
-                self._refuse()
-            weights = tuple((end - start) / (high - low) for start, end in itertools.pairwise(edges))
-            part = self._branching.decide(weights)
-            self._interval[:] = edges[part : part + 2]
-        return self._interval[0]
-
-    def _is_below(self, threshold: Any) -> Any:
-        """Whether it is less than a threshold, or than each of an array."""
-        if threshold is self:  # numpy's search compares what it looks for with itself
-            return False
-        given = np.asarray(threshold)
-        if given.dtype.kind not in "biuf" or self._scale == 0 or np.isnan(given).any():
-            self._refuse()
-        finite = np.where(np.isfinite(given), given, 0).ravel().tolist()
-        cuts = [(Fraction(each) - self._offset) / self._scale for each in finite]
-        infinite = np.isinf(given).ravel()
-        start = self._among([cut for cut, is_not in zip(cuts, infinite, strict=True) if not is_not])
-        found = np.array([(cut > start) == (self._scale > 0) for cut in cuts], dtype=np.bool_)
-        found = np.where(infinite, given.ravel() > 0, found).reshape(given.shape)
-        return bool(found) if given.ndim == 0 else found
-
-    __lt__ = __le__ = _is_below  # to be just at a threshold has no probability
-
-    def _is_above(self, threshold: Any) -> Any:
-        return np.logical_not(below) if np.ndim(below := self._is_below(threshold)) else not below
-
-    __gt__ = __ge__ = _is_above
-
-    def __floor__(self) -> int:
-        edges = [self._scale * each + self._offset for each in self._interval]
-        whole = range(math.floor(min(edges)), math.ceil(max(edges)))
-        if self._scale == 0 or len(whole) > _MOST_OUTCOMES:
-            self._refuse()
-        start = self._among([(each - self._offset) / self._scale for each in whole])
-        middle = (start + self._interval[1]) / 2
-        return math.floor(self._scale * middle + self._offset)
-
-    def __int__(self) -> int:
-        if self._scale * self._interval[0] + self._offset < 0:
-            self._refuse()
-        return self.__floor__()
-
-    __trunc__ = __int__
-
-    def _changed(self, other: Any, change: Callable[[Fraction], tuple[Fraction, Fraction]]) -> Any:
-        if isinstance(other, np.ndarray) and other.ndim:
-            return self._refuse()
-        if not isinstance(other, Real | np.ndarray) or not math.isfinite(other):
-            return self._refuse()
-        scale, offset = change(Fraction(float(other)))
-        return Uniform(self._branching, self._drawn, self._interval, scale, offset)
-
-    def __add__(self, other: Any) -> Any:
-        return self._changed(other, lambda number: (self._scale, self._offset + number))
-
-    def __mul__(self, other: Any) -> Any:
-        return self._changed(other, lambda number: (self._scale * number, self._offset * number))
-
-    def __truediv__(self, other: Any) -> Any:
-        return self._changed(other, lambda number: (self._scale / number, self._offset / number))
-
-    def __sub__(self, other: Any) -> Any:
-        return self._changed(other, lambda number: (self._scale, self._offset - number))
-
-    def __rsub__(self, other: Any) -> Any:
-        return self._changed(other, lambda number: (-self._scale, number - self._offset))
-
-    def __neg__(self) -> Any:
-        return 0 - self
-
-    __radd__, __rmul__ = __add__, __mul__
-
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **_: Any) -> Any:
-        """What numpy makes of it, with an array or a number on either side."""
-        name = ufunc.__name__
-        if method == "__call__" and name in ("floor", "trunc"):
-            return np.float64(self.__floor__() if name == "floor" else self.__int__())
-        if method != "__call__" or len(inputs) != 2 or name not in _OPERATIONS:
-            return self._refuse()
-        ours, theirs = _OPERATIONS[name]
-        one, other = inputs
-        if isinstance(one, Uniform):
-            return self._refuse() if isinstance(other, Uniform) else getattr(one, ours)(other)
-        return getattr(other, theirs)(one)
-
-
-_OPERATIONS = {  # by the name of numpy's function: for it on the left, and on the right
-    "less": ("__lt__", "__gt__"),
-    "less_equal": ("__le__", "__ge__"),
-    "greater": ("__gt__", "__lt__"),
-    "greater_equal": ("__ge__", "__le__"),
-    "add": ("__add__", "__radd__"),
-    "multiply": ("__mul__", "__rmul__"),
-    "subtract": ("__sub__", "__rsub__"),
-    "true_divide": ("__truediv__", "__rtruediv__"),
-    "divide": ("__truediv__", "__rtruediv__"),
-}
 
 
 def _shape(size: Any) -> tuple[int, ...]:

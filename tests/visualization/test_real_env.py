@@ -15,6 +15,7 @@ from gridworld.world.mdp import Mdp
 from gridworld.world.sources.enumerated import enumerate_env
 
 FROZEN_LAKE = GymnasiumConfig(id="FrozenLake-v1").compile()
+DRY_LAKE = GymnasiumConfig(id="FrozenLake-v1", kwargs={"is_slippery": False}).compile()
 
 
 def frames_of(env_id: str, states: list[int], mdp: Mdp | None = None, most_pixels: int = 512 * 512, **kwargs):
@@ -76,9 +77,11 @@ def test_large_frames_are_made_smaller():
     ("env_id", "words"),
     [
         ("NoSuchWorld-v0", "is not registered with Gymnasium .*doesn't exist"),
-        *((name, r"cannot be rendered: [^\n]*$") for name in ("Pendulum-v1", "CartPole-v1", "Blackjack-v1")),
+        ("Pendulum-v1", r"cannot be rendered: [^\n]*$"),
+        ("Blackjack-v1", "its steps are random, so it cannot be led"),
     ],
 )
 def test_what_cannot_be_rendered_is_one_sentence(env_id, words):
+    is_random = env_id == "Blackjack-v1"
     with pytest.raises(InputError, match=f"^env.id={env_id}: {words}"):
-        frames_of(env_id, [0, 4, 8], FROZEN_LAKE)
+        frames_of(env_id, [0, 1, 2], FROZEN_LAKE if is_random else DRY_LAKE)

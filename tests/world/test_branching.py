@@ -109,15 +109,15 @@ def test_types_are_those_of_numpy(draw: Callable[[Any], Any]) -> None:
 
 
 REFUSED: dict[str, tuple[Callable[[Any], Any], str]] = {
-    "a number": (lambda rng: float(rng.random()), "otherwise than in a comparison"),
+    "a number": (lambda rng: float(rng.random()), "used for more than comparisons"),
     "a number in an array": (
         lambda rng: np.array([rng.random()], np.float32),
-        "otherwise than in a comparison",
+        "used for more than comparisons",
     ),
-    "a number in a text": (lambda rng: f"{rng.random():.2f}", "otherwise than in a comparison"),
-    "a root": (lambda rng: np.sqrt(rng.random()), "otherwise than in a comparison"),
-    "two numbers": (lambda rng: rng.random() < rng.random(), "otherwise than in a comparison"),
-    "equality": (lambda rng: rng.random() == 0.5, "otherwise than in a comparison"),
+    "a number in a text": (lambda rng: f"{rng.random():.2f}", "used for more than comparisons"),
+    "a root": (lambda rng: np.sqrt(rng.random()), "used for more than comparisons"),
+    "two numbers": (lambda rng: rng.random() < rng.random(), "used for more than comparisons"),
+    "equality": (lambda rng: rng.random() == 0.5, "used for more than comparisons"),
     "normal": (lambda rng: rng.normal(), r"np_random.normal\(\) has too many outcomes"),
     "poisson": (lambda rng: rng.poisson(2), r"np_random.poisson\(\) has too many outcomes"),
     "many integers": (lambda rng: rng.integers(10**6), "a draw has 1,000,000 outcomes"),
