@@ -1,6 +1,6 @@
 // The page: its controls, what it shows, links and files, and the loop in which things learn.
 
-import { argmax, atStart, backup, oneHot, outcome, score, solve, split } from "./solver.js";
+import { argmax, atStart, backup, evaluate, oneHot, outcome, score, solve, split } from "./solver.js";
 import { drawBoard, drawCurve, gradient, precise, short } from "./view.js";
 import { drawOutcome, drawStart, epsilonGreedy, Learner, PolicyIteration, ValueIteration } from "./learners.js";
 import { check, checked, cellName, command, compile, emptyMap, fromTables, link, mapText, Mistake, MOST_CELLS, MOST_SIDE, parse, readLink, SETTINGS } from "./world.js";
@@ -578,3 +578,4 @@ else {
 }
 showEpisode();
 requestAnimationFrame(frame);
+globalThis.playground = { app, compile, evaluate, Learner, outcome, parse, score, solve, split }; // for the console

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from gridworld.base.console import plain
 from gridworld.base.errors import InputError
@@ -26,7 +27,7 @@ from gridworld.training.saved_run import SavedRun, read_visits
 from gridworld.visualization.picture import Moment, PolicyHistory
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.grid import GridMdp
-from gridworld.world.mdp import Mdp
+from gridworld.world.mdp import IntArray, Mdp
 
 _MODULES = ("world", "solver", "learners", "view", "app")  # in the order of their imports
 _IMPORT = re.compile(r'^import \{[^}]*\} from "\./\w+\.js";\n', re.MULTILINE)
@@ -61,8 +62,8 @@ def run_page(saved: SavedRun) -> str:
     data = _world(mdp, config.evaluation.gamma, evaluator.max_episode_steps)
     last, steps = saved.snapshot(), saved.steps()
     moments = [moment for moment in _kept(saved) if moment.step < steps]
-    greedy = [*(moment.greedy for moment in moments), last.greedy]
-    values = [*(moment.values for moment in moments), last.values]
+    greedy: list[IntArray] = [*(moment.greedy for moment in moments), last.greedy]
+    values: list[NDArray[Any]] = [*(moment.values for moment in moments), last.values]
     regrets = [evaluator.score(one_hot_policy(each, mdp.num_actions)).regret for each in greedy]
     try:
         visits = read_visits(saved.run, mdp.next_state.shape[:2]).ravel().tolist()
@@ -110,7 +111,7 @@ def _world(mdp: Mdp, gamma: float, step_limit: int) -> dict[str, Any]:
         "next": mdp.next_state,
         "prob": mdp.probability,
         "reward": mdp.reward,
-        "thresholds": mdp.thresholds,
+        "thresholds": np.minimum(mdp.thresholds, 2.0),  # some are infinite, which JSON has no word for
         "start": mdp.start,
     }
     masks = {"terminal": mdp.terminal, "goal": mdp.goal, "absorbing": mdp.absorbing}
