@@ -52,6 +52,11 @@ def world_page(mdp: Mdp, gamma: float, step_limit: int) -> str:
     return _page(_world(mdp, gamma, step_limit))
 
 
+def maps_page() -> str:
+    """The page of the shipped maps, for links to any map."""
+    return _page({"shipped": shipped(), "title": "", "gamma": GAMMA, "link": ""})
+
+
 def run_page(saved: SavedRun) -> str:
     """The page of a run: its world, and the policies that it kept while it learnt, the last one with its Q.
 
