@@ -148,45 +148,18 @@ class Chain {
     return found;
   }
 
-  /** (S,), a number from 1 on for each class of states that an episode never leaves, else 0 (Tarjan, 1972). */
+  /** (S,), a number from 1 on for each class of states that an episode never leaves, else 0. */
   recurrent() {
-    const { world, n, taken, perState } = this, found = new Int32Array(n);
-    const ends = stepsTo(world, taken, world.terminal), order = new Int32Array(n), low = new Int32Array(n);
-    const inside = s => !world.absorbing[s] && ends[s] < 0;
-    const stack = [], onStack = new Uint8Array(n), leaves = new Uint8Array(n);
-    let count = 0, classes = 0;
-    for (let root = 0; root < n; root++) {
-      if (!inside(root) || order[root]) continue;
-      const work = [[root, root * perState]];
-      while (work.length) {
-        const frame = work[work.length - 1], s = frame[0];
-        if (!order[s]) (order[s] = low[s] = ++count), stack.push(s), (onStack[s] = 1);
-        let child = -1;
-        for (; frame[1] < (s + 1) * perState && child < 0; frame[1]++) {
-          const to = world.next[frame[1]];
-          if (!taken[frame[1]]) continue;
-          if (!inside(to)) leaves[s] = 1;
-          else if (!order[to]) child = to;
-          else if (onStack[to]) low[s] = Math.min(low[s], order[to]);
-          else leaves[s] = 1;
-        }
-        if (child >= 0) {
-          work.push([child, child * perState]);
-          continue;
-        }
-        work.pop();
-        let isLeft = leaves[s];
-        if (low[s] === order[s]) {
-          const members = stack.splice(stack.indexOf(s));
-          members.forEach(each => ((onStack[each] = 0), (isLeft |= leaves[each])));
-          if (!isLeft) classes++, members.forEach(each => (found[each] = classes));
-        }
-        if (work.length) {
-          const parent = work[work.length - 1][0];
-          low[parent] = Math.min(low[parent], low[s]);
-          if (low[s] === order[s]) leaves[parent] = 1;
-        }
-      }
+    const { world, n, taken, perState } = this, found = new Int32Array(n), ends = stepsTo(world, taken, world.terminal);
+    const known = ends.map((steps, s) => steps >= 0 || world.absorbing[s]);
+    for (let s = 0, classes = 0; s < n; s++) {
+      if (known[s]) continue;
+      const ahead = [s], seen = new Set(ahead), back = stepsTo(world, taken, ends.map((_, t) => t === s));
+      for (const from of ahead)
+        for (let at = from * perState; at < (from + 1) * perState; at++)
+          if (taken[at] && !seen.has(world.next[at])) ahead.push(world.next[at]), seen.add(world.next[at]);
+      if (ahead.every(t => back[t] >= 0)) classes++, ahead.forEach(t => ((known[t] = 1), (found[t] = classes)));
+      else back.forEach((steps, t) => steps >= 0 && (known[t] = 1)); // who comes here is led astray as well
     }
     return found;
   }
