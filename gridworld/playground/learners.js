@@ -42,12 +42,12 @@ export function drawOutcome(world, state, action, random) {
 /** Temporal-difference control with a table (Sutton and Barto, 2nd ed., sections 6.4 to 6.6). */
 export class Learner {
   /**
-   * `kind`: q_learning, sarsa or expected_sarsa. `settings`, which may change meanwhile: gamma, epsilon, rate, power (the
-   * step size is rate times visits ** -power) and initial, the value of all actions at first. `random` has `world` and
-   * `agent`, which draw from [0, 1).
+   * `kind`: q_learning, sarsa or expected_sarsa. `settings`, which may change meanwhile: gamma, epsilon, rate, power
+   * (the step size is rate times visits ** -power) and initial, the value of all actions at first. `random` has
+   * `world` and `agent`, which draw from [0, 1).
    */
   constructor(world, kind, settings, random) {
-    Object.assign(this, { world, kind, settings, random, steps: 0, episodes: 0, elapsed: 0, lastReturn: NaN, sum: 0 });
+    Object.assign(this, { world, kind, settings, random, steps: 0, episodes: 0, elapsed: 0 });
     this.q = floats(world.n * world.A, settings.initial);
     world.terminal.forEach((is, s) => is && this.q.fill(0, s * world.A, (s + 1) * world.A));
     this.visits = new Int32Array(this.q.length);
@@ -60,7 +60,7 @@ export class Learner {
     this.world = world;
     world.terminal.forEach((is, s) => is && this.row(s).fill(0));
     if (!world.absorbing[this.state] && world.map.tiles[this.state] !== "C") return;
-    Object.assign(this, { state: drawStart(world, this.random.world), elapsed: 0, sum: 0 });
+    Object.assign(this, { state: drawStart(world, this.random.world), elapsed: 0 });
     this.action = this.act(this.state);
   }
 
@@ -77,8 +77,8 @@ export class Learner {
 
   step() {
     const { world, settings, kind, q, visits, random } = this, pair = this.state * world.A + this.action;
-    const at = drawOutcome(world, this.state, this.action, random.world), reached = world.next[at], reward = world.reward[at];
-    const isOver = world.terminal[reached] || ++this.elapsed >= world.limit;
+    const at = drawOutcome(world, this.state, this.action, random.world), reached = world.next[at];
+    const reward = world.reward[at], isOver = world.terminal[reached] || ++this.elapsed >= world.limit;
     const state = isOver ? drawStart(world, random.world) : reached;
     const row = this.row(reached);
     let ahead, action;
@@ -87,8 +87,7 @@ export class Learner {
     else ahead = rowPolicy(row, settings.epsilon).reduce((sum, p, a) => sum + p * row[a], 0);
     q[pair] += settings.rate * ++visits[pair] ** -settings.power * (reward + settings.gamma * ahead - q[pair]);
     this.steps++;
-    this.sum += reward;
-    if (isOver) Object.assign(this, { elapsed: 0, lastReturn: this.sum, sum: 0, episodes: this.episodes + 1 });
+    if (isOver) Object.assign(this, { elapsed: 0, episodes: this.episodes + 1 });
     this.state = state;
     this.action = kind === "sarsa" && !isOver ? action : this.act(state);
   }

@@ -29,7 +29,7 @@ from gridworld.world.chain import one_hot_policy
 from gridworld.world.grid import GridMdp
 from gridworld.world.mdp import IntArray, Mdp
 
-_MODULES = ("world", "solver", "learners", "view", "app")  # in the order of their imports
+_MODULES = ("world", "solver", "learners", "view", "show", "app")  # in the order of their imports
 _IMPORT = re.compile(r'^import \{[^}]*\} from "\./\w+\.js";\n', re.MULTILINE)
 _MOST_STATES, _MOST_SIDE, _MOST_OUTCOMES = 2500, 60, 100_000  # the first two are in world.js too
 _LONGEST_NAME = 80
@@ -76,6 +76,7 @@ def run_page(saved: SavedRun) -> str:
         visits = None
     data["run"] = {
         "title": f"{_name(config.agent.name)} on {_name(mdp.name)}, seed {config.seed}, {steps:,} steps",
+        "agent": config.agent.name,
         "gamma": config.evaluation.gamma,
         "agent_gamma": float(getattr(config.agent, "gamma", config.evaluation.gamma)),
         "steps": [*(moment.step for moment in moments), steps],

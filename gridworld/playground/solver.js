@@ -106,7 +106,8 @@ class Chain {
   /** sum over a state's outcomes of weight times `of(outcome)`. */
   expected(of) {
     const sums = floats(this.n), { weight, perState } = this;
-    for (let at = 0; at < weight.length; at++) if (weight[at] > 0) sums[Math.floor(at / perState)] += weight[at] * of(at);
+    for (let at = 0; at < weight.length; at++)
+      if (weight[at] > 0) sums[Math.floor(at / perState)] += weight[at] * of(at);
     return sums;
   }
 
@@ -166,9 +167,10 @@ class Chain {
 
   /** Value and its scale, the expected sum of |r|; with their slopes in gamma if asked for. */
   evaluation(gamma, withSlope = false) {
-    const { reward, next } = this.world, parts = both => [both[0].map((x, s) => x - both[1][s]), both[0].map((x, s) => x + both[1][s])];
-    const sums = this.sums([this.expected(at => Math.max(reward[at], 0)), this.expected(at => Math.max(-reward[at], 0))], gamma);
-    const [v, scale] = parts(sums);
+    const { reward, next } = this.world;
+    const parts = ([gains, losses]) => [gains.map((x, s) => x - losses[s]), gains.map((x, s) => x + losses[s])];
+    const paid = [1, -1].map(sign => this.expected(at => Math.max(sign * reward[at], 0)));
+    const sums = this.sums(paid, gamma), [v, scale] = parts(sums);
     if (!withSlope) return { v, scale };
     const finite = sums.map(sum => sum.map(x => (Number.isFinite(x) ? x : 0)));
     const slopes = this.sums(finite.map(sum => this.expected(at => sum[next[at]])), gamma);
@@ -190,7 +192,7 @@ export function score(world, solution, policy) {
   return { v, value, regret, certified: regret <= CERTIFIED * atStart(world, solution.scale) };
 }
 
-/** What an episode of at most `limit` steps comes to: probabilities of goal, trap and neither, and its expected length. */
+/** What an episode of at most `limit` steps comes to: the probabilities of its ends, and its expected length. */
 export function outcome(world, policy, limit) {
   const chain = new Chain(world, policy), { n, terminal, next } = world;
   const used = [...chain.taken.keys()].filter(at => chain.taken[at] && !terminal[Math.floor(at / chain.perState)]);
@@ -268,7 +270,8 @@ function discounted(world, gamma, greedy) {
     seen.add(greedy.join());
     greedy = greedy.map((action, s) => {
       const one = s * A + best[s], other = s * A + action;
-      return q[one] - q[other] > NOTHING + precision * IMPROVEMENT * Math.max(sizes[one], sizes[other]) ? best[s] : action;
+      const least = precision * IMPROVEMENT * Math.max(sizes[one], sizes[other]);
+      return q[one] - q[other] > NOTHING + least ? best[s] : action;
     });
     if (!seen.has(greedy.join())) continue;
     const optimal = Uint8Array.from(q, (value, at) => {
@@ -301,7 +304,8 @@ function byValueAndSlope(world, gamma, greedy) {
 
 function bestActions(world, found, gamma, greedy, worse) {
   const { n, A, next, reward } = world, lost = found.v.map(x => (Number.isFinite(x) ? 0 : 1)), size = visible(world);
-  const delay = advantage(world, found.slope, found.slopeScale, gamma, at => found.v[next[at]], at => found.scale[next[at]]);
+  const ahead = [at => found.v[next[at]], at => found.scale[next[at]]];
+  const delay = advantage(world, found.slope, found.slopeScale, gamma, ...ahead);
   let gain, better;
   for (const negligible of [0, size]) {
     gain = advantage(world, found.v, found.scale, gamma, at => reward[at], at => Math.abs(reward[at]), negligible);
@@ -321,7 +325,8 @@ function bestActions(world, found, gamma, greedy, worse) {
       if (delay.gained[at] < delay.gained[soonest]) soonest = at;
     }
     if (isBetter && best >= 0) improved[s] = best - s * A;
-    if (!isBetter && !lost[s] && delay.gained[soonest] < -delay.rounding[soonest] * SAME_SLOPE) improved[s] = soonest - s * A;
+    const isSooner = !lost[s] && delay.gained[soonest] < -delay.rounding[soonest] * SAME_SLOPE;
+    if (!isBetter && isSooner) improved[s] = soonest - s * A;
   }
   return { optimal, improved };
 }
@@ -388,7 +393,8 @@ function resting(world) {
 /** (S, A), those of `actions` by which one can stay `within` some states for ever. */
 function staying(world, some, within, actions) {
   while (true) {
-    const keeping = actions.map((is, pair) => is && within[Math.floor(pair / world.A)] && !some(pair, at => !within[world.next[at]]));
+    const keeps = pair => within[Math.floor(pair / world.A)] && !some(pair, at => !within[world.next[at]]);
+    const keeping = actions.map((is, pair) => is && keeps(pair));
     const left = within.map((_, s) => (keeping.subarray(s * world.A, (s + 1) * world.A).some(each => each) ? 1 : 0));
     if (left.every((is, s) => is === within[s])) return keeping;
     within = left;

@@ -40,7 +40,7 @@ export function parse(text) {
   const rows = lines.length, cols = lines[0].length;
   if (!cols) refuse("the map is empty; it needs at least a start 'S' and a goal 'G'");
   if (rows > MOST_SIDE || cols > MOST_SIDE || rows * cols > MOST_CELLS)
-    refuse(`${rows} rows of ${cols} columns are too large; at most ${MOST_CELLS} cells fit here, ${MOST_SIDE} in a row`);
+    refuse(`${rows} rows of ${cols} columns are too large; at most ${MOST_CELLS} cells fit, ${MOST_SIDE} in a row`);
   lines.forEach((line, row) => {
     const strange = line.search(/[^SGTC#.]/);
     if (strange >= 0)
@@ -156,11 +156,12 @@ export function readLink(hash, shipped) {
   const tiles = found.get("map") ?? "classic";
   found.delete("map");
   const named = Object.hasOwn(shipped, tiles);
-  if (!named && !/^[SGTCW._]+$/.test(tiles)) refuse("map: must be a shipped map's name, or rows of S, G, T, C, W and .");
+  if (!named && !/^[SGTCW._]+$/.test(tiles))
+    refuse("map: must be a shipped map's name, or rows of S, G, T, C, W and .");
   const map = parse(named ? shipped[tiles].text : tiles.replaceAll("W", "#").replaceAll("_", "\n"));
   const settings = { ...(named ? shipped[tiles].settings : SETTINGS) };
   for (const [key, text] of found) {
-    if (!Object.hasOwn(SETTINGS, key)) refuse("the link has an unknown setting; it was made by another version, or changed");
+    if (!Object.hasOwn(SETTINGS, key)) refuse("the link has an unknown setting; is it another version's?");
     settings[key] = checked(key, text ?? "");
   }
   return { map, settings };
@@ -170,7 +171,8 @@ export function readLink(hash, shipped) {
 export function command(map, settings, shipped, agent) {
   const text = mapText(map), name = Object.keys(shipped).find(each => shipped[each].text === text);
   const base = name ? shipped[name].settings : SETTINGS;
-  const words = Object.keys(DEFAULTS).filter(key => settings[key] !== base[key]).map(key => `env.${key}=${settings[key]}`);
+  const changed = Object.keys(DEFAULTS).filter(key => settings[key] !== base[key]);
+  const words = changed.map(key => `env.${key}=${settings[key]}`);
   if (settings.gamma !== 0.99) words.push(`agent.gamma=${settings.gamma}`, `evaluation.gamma=${settings.gamma}`);
   const world = name ? `env=${name}` : "env.layout=map.txt";
   const written = name ? "" : `printf '${text.replaceAll("\n", "\\n")}\\n' > map.txt && `;

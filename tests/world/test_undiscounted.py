@@ -211,7 +211,7 @@ def test_a_discount_that_rounding_hides_is_refused(gamma):
 
 @pytest.mark.parametrize("dense", [512, 0])
 def test_a_way_to_rest_for_ever_is_worth_what_it_costs(dense, monkeypatch):
-    """Waiting costs 1 a step and leads to rest, not to an end, with probability 1/2: two steps, not for ever."""
+    """Waiting costs 1 a step and leads to rest with probability 1/2: it costs 2, not infinitely much."""
     monkeypatch.setattr("gridworld.world.chain.DENSE_STATES", dense)
     next_state = np.array([[[0, 1], [2, 2]], [[1, 1], [1, 1]], [[2, 2], [2, 2]]])
     ends = np.zeros((3, 2, 2), dtype=bool)
