@@ -9,6 +9,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import option_tables
 
 import gridworld
+from gridworld.playground.page import maps_page
 
 project = "gridworld"
 author = "the gridworld maintainers"
@@ -31,8 +32,9 @@ html_css_files = ["site.css"]
 
 
 def setup(app):
-    """Have the tables of options filled in, and headings in docstrings set in bold."""
+    """Have tables of options filled in, headings in docstrings set in bold, and the playground written."""
     app.connect("source-read", lambda app, name, source: fill(name, source))
+    app.connect("build-finished", lambda app, _: Path(app.outdir, "playground.html").write_text(maps_page()))
     app.connect("autodoc-process-docstring", lambda app, what, name, thing, options, lines: tidy(lines))
 
 
