@@ -6,6 +6,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import notebook
 import option_tables
 
 import gridworld
@@ -32,16 +33,18 @@ html_css_files = ["site.css"]
 
 
 def setup(app):
-    """Have tables of options filled in, headings in docstrings set in bold, and the playground written."""
+    """Have the options and the notebook filled in, docstrings' headings set in bold, the playground written."""
     app.connect("source-read", lambda app, name, source: fill(name, source))
     app.connect("build-finished", lambda app, _: Path(app.outdir, "playground.html").write_text(maps_page()))
     app.connect("autodoc-process-docstring", lambda app, what, name, thing, options, lines: tidy(lines))
 
 
 def fill(name, source):
-    """Fill in the page of options."""
+    """Fill in the page of options and the notebook."""
     if name == "reference/options":
         source[0] = option_tables.fill(source[0])
+    if name == "tutorials/quickstart":
+        source[0] = source[0].replace("<!-- notebook -->", notebook.page())
 
 
 def tidy(lines):
