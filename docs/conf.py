@@ -33,7 +33,7 @@ html_css_files = ["site.css"]
 
 
 def setup(app):
-    """Have the options and the notebook filled in, docstrings' headings set in bold, the playground written."""
+    """Have options and the notebook filled in, docstrings' headings set in bold, the playground written."""
     app.connect("source-read", lambda app, name, source: fill(name, source))
     app.connect("build-finished", lambda app, _: Path(app.outdir, "playground.html").write_text(maps_page()))
     app.connect("autodoc-process-docstring", lambda app, what, name, thing, options, lines: tidy(lines))
