@@ -22,7 +22,8 @@ function setWorld(map, settings, keep = false) {
   }
   if (isMap) {
     app.link = link(map, settings, shipped);
-    history.replaceState(null, "", `#${app.link}`);
+    clearTimeout(app.linking); // browsers refuse too many changes of the address
+    app.linking = setTimeout(() => history.replaceState(null, "", `#${app.link}`), 200);
     buildGrid();
   }
   const { process, world } = app, learnsOn = keep && process instanceof Learner;
@@ -257,7 +258,7 @@ function listen() {
   });
   const step = by => then(() => ((app.following = false), walk(by)));
   Object.assign($("back"), { onclick: step(-1) }), Object.assign($("forward"), { onclick: step(1) });
-  $("copy-link").onclick = event => copy(location.href, event.target);
+  $("copy-link").onclick = event => copy(`${location.href.split("#")[0]}#${app.link}`, event.target);
   $("copy-command").onclick = event => copy(commandLine(), event.target);
   $("download").onclick = download;
   $("load").onchange = event => event.target.files[0] && loadFile(event.target.files[0]);
