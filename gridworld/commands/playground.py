@@ -14,7 +14,7 @@ import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 
-from gridworld.base.atomic_write import write_text
+from gridworld.base.atomic_write import make_folder, write_text
 from gridworld.base.bounds import STEP_LIMIT
 from gridworld.base.console import printable, program, telling_if_slow
 from gridworld.base.errors import InputError
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str]) -> None:
         os.close(handle)
         path = Path(name)
     else:
-        out.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(out.parent)
         path = out
     write_text(path, page)
     print(printable(str(path)))

@@ -24,8 +24,8 @@ export const FIELDS = [ // key, label, the slider's least, most and step
 export const HYPER = [
   ["epsilon", "exploration ε", 0, 1, 0.01],
   ["rate", "learning rate α", 0.01, 1, 0.01],
-  ["power", "decay of α by visits", 0, 1, 0.05],
-  ["initial", "first Q", -2, 2, 0.1],
+  ["power", "decay of α", 0, 1, 0.05],
+  ["initial", "initial Q", -2, 2, 0.1],
 ];
 export const app = {
   ...{ map: null, settings: { ...SETTINGS }, world: null, solution: null, problem: "", undo: [] },
@@ -210,7 +210,7 @@ function showCurve() {
     if (process instanceof Learner && app.slow < 12) {
       point.push(score(world, solution, epsilonGreedy(world, process.q, process.settings.epsilon)).regret);
       app.slow = performance.now() - started;
-    }
+    } else app.slow *= 0.8; // tried again later
     app.curve.push(point);
     if (app.curve.length > 600) app.curve = app.curve.filter((_, i) => i % 2 === 0);
   }
@@ -316,7 +316,7 @@ function leads(pair) {
   }
   return Array.from(ways.values(), ({ to, paid, p }) => {
     const after = world.terminal[to] ? "ends" : `V* ${short(solution.v[to])}`;
-    const name = to === s ? "stays" : world.name(to);
+    const name = to === s ? "stays" : `to ${world.name(to)}`;
     return `${Number((100 * p).toFixed(1))} % ${name} (${paid ? `reward ${short(paid)}` : "no reward"}, ${after})`;
   }).join("; ");
 }

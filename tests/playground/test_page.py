@@ -185,6 +185,23 @@ def test_it_is_drawn_on_with_keys_and_read_aloud(page: Page) -> None:
     assert (tiles(browser), message(browser)) == ("SG.T", "")
 
 
+def test_a_cell_says_why_and_an_episode_goes_step_by_step(page: Page) -> None:
+    browser = page("map=aima_4x3")
+    browser.find_elements("css selector", "[role=gridcell]")[9].click()
+    text = browser.find_element("id", "cell").text
+    assert "right 0.53 0.53" in text
+    assert "left ✓ 0.60 0.60" in text.replace(" ●", "")
+    assert "right: 80 % to row 3, column 3 (reward -0.04, V* 0.57); 20 % stays" in text.replace("\u2212", "-")
+    browser = page("map=S.W_T.G")
+    told = []
+    for button in ("forward", "forward", "forward", "forward", "forward", "back"):
+        browser.find_element("id", button).click()
+        told.append(browser.find_element("id", "episode").text)
+    assert told[0] == "step 0 of 3: start; row 1, column 1"
+    assert told[3] == told[4] == "step 3 of 3: right, reward 1.00, discounted return 0.98; row 2, column 3"
+    assert told[5] == told[2] == "step 2 of 3: down, reward 0.00, discounted return 0.00; row 2, column 2"
+
+
 def test_a_learner_goes_on_in_a_world_that_changes(page: Page) -> None:
     browser = page("map=S..G")
     browser.find_element("css selector", "[value=q_learning]").click()
