@@ -66,6 +66,8 @@ def run_page(saved: SavedRun) -> str:
     mdp, config, evaluator = saved.mdp, saved.config, saved.evaluator()
     data = _world(mdp, config.evaluation.gamma, evaluator.max_episode_steps)
     last, steps = saved.snapshot(), saved.steps()
+    if not np.isfinite(last.values).all() or (last.q is not None and not np.isfinite(last.q).all()):
+        raise InputError(f"{saved.run.folder}: the agent's values are not finite numbers")
     moments = [moment for moment in _kept(saved) if moment.step < steps]
     greedy: list[IntArray] = [*(moment.greedy for moment in moments), last.greedy]
     values: list[NDArray[Any]] = [*(moment.values for moment in moments), last.values]
