@@ -229,8 +229,8 @@ function listen() {
   };
   const hyper = (key, value) => {
     app.hyper[key] = value;
-    if (key === "initial" && !app.process.steps) restart();
-    app.process.settings = learnerSettings();
+    if (key === "initial" && !app.process?.steps) restart();
+    if (app.process) app.process.settings = learnerSettings();
     refresh();
   };
   const more = FIELDS.slice(3).map(each => field(each, change));

@@ -59,7 +59,7 @@ export class Learner {
   adopt(world) {
     this.world = world;
     world.terminal.forEach((is, s) => is && this.row(s).fill(0));
-    if (!world.absorbing[this.state] && world.map.tiles[this.state] !== "C") return;
+    if (!world.absorbing[this.state] && world.map?.tiles[this.state] !== "C") return;
     Object.assign(this, { state: drawStart(world, this.random.world), elapsed: 0 });
     this.action = this.act(this.state);
   }

@@ -289,6 +289,7 @@ function showTexts() {
     const cells = $("grid").querySelectorAll("[role=gridcell]");
     return cells.forEach((cell, s) => cell.setAttribute("aria-label", `${cellName(map, s)}: ${describe(s)}`));
   }
+  if (!world) return table.querySelector("tbody").replaceChildren();
   const { cost } = regrets(), { A, absorbing, actions } = world;
   const rows = Array.from({ length: world.n }, (_, s) => {
     const best = actions.filter((_, a) => solution.optimal[s * A + a]).join(", "), takes = actions[now.greedy[s]];

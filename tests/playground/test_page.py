@@ -219,6 +219,33 @@ def test_a_learner_goes_on_in_a_world_that_changes(page: Page) -> None:
     assert (tiles(browser), after) == ("SS.G", before)
 
 
+MONKEY = """
+const [seed, done] = arguments, keys = [..."w.sgtcz", "ArrowUp", "ArrowLeft", "Enter", "Home", "End"];
+const values = ["0", "1", "0.5", "-1", "", "12", "1000"];
+const kinds = "button, select, input:not([type=file]), summary, #states tr, #grid div";
+let state = seed, left = 250;
+const draw = of => of[(state = (state * 48271) % 2147483647) % of.length];
+const act = () => {
+  const all = [...document.querySelectorAll(kinds)];
+  const one = draw(all.filter(each => !each.disabled && each.checkVisibility()));
+  const press = new KeyboardEvent("keydown", { key: draw(keys), bubbles: true });
+  if (one.role === "gridcell") one.focus(), one.dispatchEvent(press);
+  else if (one.matches("select, input")) {
+    one.value = one.matches("select") ? draw(one.options).value : draw(values);
+    for (const kind of ["input", "change"]) one.dispatchEvent(new Event(kind));
+  } else if (one.id !== "download") one.click();
+  if (--left) (left % 5 ? queueMicrotask : requestAnimationFrame)(act);
+  else done();
+};
+act();
+"""
+
+
+@pytest.mark.parametrize("name", ["world.html", "map.html", "table.html"])
+def test_no_order_of_clicks_and_keys_is_an_error(name: str, page: Page) -> None:
+    page(name=name).execute_async_script(MONKEY, 5)  # `page` looks at the browser's log
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("name", ["world.html", "map.html", "table.html"])
 def test_a_phone_shows_it_whole(scheme: str, name: str, page: Page, browser: Any) -> None:
