@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib
+import importlib.util
 import io
 import re
 import shlex
@@ -11,6 +12,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import yaml
 from helpers.support import ROOT, configure, script
@@ -61,6 +63,16 @@ def blocks(page: Path, *languages: str) -> list[Block]:
         found.append(Block(language, file or None, content, not text[end : match.start()].strip()))
         end = match.end()
     return [block for block in found if not languages or block.language in languages]
+
+
+def module_of(name: str) -> Any:
+    """A module of docs/."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def shortened(words: list[str]) -> list[str]:

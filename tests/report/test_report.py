@@ -441,7 +441,7 @@ def test_swept_settings_are_a_line_or_a_heatmap_and_the_opening_is_short(
         "On classic, ppo by learning_rate and n_epochs: all seeds are certified with "
         + ", ".join(f"learning_rate={rate} n_epochs={depth}" for rate in (0.002, 0.01) for depth in (3, 10)),
         "; none with learning_rate=0.1 n_epochs=3, learning_rate=0.1 n_epochs=10, learning_rate=0.1 n_epochs",
-        "; 2 tie for best, as no interval tells them apart, among them: ppo (learning_rate=0.002, n_epochs",
+        "; 2 tie for best, as no interval separates them, among them: ppo (learning_rate=0.002, n_epochs",
         "<h1>ppo on classic</h1>",
         "<title>9 agents on classic, gridworld</title>",
         '<th scope="col">ppo (learning_<wbr>rate=<wbr>0.1, n_<wbr>epochs=<wbr>3)</th>',
@@ -687,5 +687,5 @@ def test_pictures_are_embedded_within_bounds(maker: Maker, tmp_path: Path) -> No
     pattern = r'<img src="data:image/(\w+);base64,\S+ width="(\d+)" height="(\d+)" alt="([^"]*)"'
     assert re.findall(pattern, page) == [
         ("png", "900", "500", "ppo, seed 1, certified optimal: policy"),
-        ("gif", "40", "30", "ppo, seed 1, certified optimal: policy while it learnt"),
+        ("gif", "40", "30", "ppo, seed 1, certified optimal: policy while it learned"),
     ]
