@@ -171,11 +171,12 @@ def test_two_processes_find_the_same() -> None:
 
 VALUES = [  # a world, a discount, and Q* of its live states
     (expect.CONSTANT, 0.9, [[1, 1]]),
-    (expect.CORRIDOR, 0.5, [[0.25, 0.25], [0.5, 0.5], [1, 1]]),
+    (expect.CORRIDOR, 0.5, [[0.25, 0.25], [0.5, 0.5], [1, 1], [0.4, 0.125]]),
     (expect.BANDIT, 0.9, [[0, 1, 0.5]]),
     (expect.TWO_CONTEXTS, 0.9, np.eye(2)),
-    (expect.END_LIKE_THE_START, 0.9, [[0.9, 0.9], [1, 1]]),
+    (expect.END_LIKE_THE_START, 0.9, [[0.7, 0.9], [1, 1]]),
     (expect.ENDLESS, 0.8, [[5, 5]]),
+    (expect.CUT_SHORT, 0.8, [[1.1, 4], [5, 5]]),
     (expect.GAMBLE, 0.9, [[0.1, 0.4]]),
     (expect.ALTERNATION, 0.8, [[0.8**2 / 0.36, 0.8 / 0.36], [0.8 / 0.36, 1 / 0.36]]),
     (expect.TRAP, 0.9, [[0.2, 0.7], [0, 1]]),
