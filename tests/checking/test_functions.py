@@ -133,7 +133,7 @@ CAUGHT = {
     ("dqn", "next"): "delay",
     ("ppo", "sign"): "choice",
     ("ppo", "dones"): "termination",
-    ("ppo", "actions"): "choice",
+    ("ppo", "gamma"): "discount",
     ("ppo", "truncated"): "truncation",
 }
 STEPS = {"dqn": 2000, "ppo": 4000}

@@ -140,7 +140,7 @@ def ppo(
     ent_coef: float = 0.01,
     bug: str = "",
 ) -> dict[str, Any]:
-    """ppo.py. Bugs: sign, dones, actions; and truncated, which is ppo.py's own."""
+    """ppo.py. Bugs: sign, dones, gamma; and truncated, which is ppo.py's own."""
     learning_rate, num_steps, num_minibatches, update_epochs = 2.5e-3, 128, 4, 4
     gae_lambda, clip_coef, vf_coef, max_grad_norm = 0.95, 0.2, 0.5, 0.5
     envs = vector(env, seed)
@@ -170,6 +170,7 @@ def ppo(
 
         with torch.no_grad():
             next_value = agent.critic(next_obs).flatten()
+            discount = 1.0 if bug == "gamma" else gamma
             advantages, lastgaelam = torch.zeros_like(rewards), torch.zeros(1)
             for t in reversed(range(num_steps)):
                 last = t == num_steps - 1
@@ -177,19 +178,16 @@ def ppo(
                 if bug == "dones":
                     nextnonterminal = torch.ones(1)
                 nextvalues = next_value if last else values[t + 1]
-                delta = rewards[t] + gamma * nextvalues * nextnonterminal - values[t]
-                lastgaelam = delta + gamma * gae_lambda * nextnonterminal * lastgaelam
+                delta = rewards[t] + discount * nextvalues * nextnonterminal - values[t]
+                lastgaelam = delta + discount * gae_lambda * nextnonterminal * lastgaelam
                 advantages[t] = lastgaelam
             returns = advantages + values
 
         b_inds = np.arange(num_steps)
-        b_actions = actions.roll(1) if bug == "actions" else actions
         for _ in range(update_epochs):
             np.random.shuffle(b_inds)
             for mb_inds in np.split(b_inds, num_minibatches):
-                _, newlogprob, entropy, newvalue = agent.get_action_and_value(
-                    obs[mb_inds], b_actions[mb_inds]
-                )
+                _, newlogprob, entropy, newvalue = agent.get_action_and_value(obs[mb_inds], actions[mb_inds])
                 ratio = (newlogprob - logprobs[mb_inds]).exp()
                 mb_advantages = advantages[mb_inds]
                 mb_advantages = (mb_advantages - mb_advantages.mean()) / (mb_advantages.std() + 1e-8)
