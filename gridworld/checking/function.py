@@ -37,25 +37,20 @@ class FunctionConfig(AgentConfig):
     arguments: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def signature(self) -> inspect.Signature:
-        """Its parameters."""
-        try:
-            return inspect.signature(self.train)
-        except ValueError:  # of a function in C
-            raise InputError(f"{self.name}: must be train(env, total_timesteps, seed)") from None
-
-    @property
     def known(self) -> list[str]:
         """The names of further arguments."""
-        parameters = list(self.signature.parameters.values())[3:]
+        try:
+            parameters = list(inspect.signature(self.train).parameters.values())[3:]
+        except ValueError:  # of a function in C
+            return []
         kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
         return [each.name for each in parameters if each.kind in kinds]
 
     def build(self, context: TrainingContext) -> FunctionAgent:
         """Refuse a function that cannot be called so."""
         try:
-            self.signature.bind(None, None, None, **self.arguments)
-        except TypeError as error:
+            inspect.signature(self.train).bind(None, None, None, **self.arguments)
+        except (TypeError, ValueError) as error:
             raise InputError(
                 f"{self.name}: must be train(env, total_timesteps, seed), and may take gamma and what has a "
                 f"default ({error})"

@@ -155,9 +155,8 @@ def _check_group(
     outcomes: dict[str, Outcomes] = {probe.name: [] for probe in group}
     for number in range(SEEDS):
         if unsettled := [probe for probe in group if not _is_settled(outcomes[probe.name])]:
-            for probe, outcome in zip(
-                unsettled, _once(config, given, seed + number, unsettled, steps), strict=True
-            ):
+            found = _once(config, given, seed + number, unsettled, steps)
+            for probe, outcome in zip(unsettled, found, strict=True):
                 outcomes[probe.name].append(outcome)
     seconds = (time.monotonic() - started) / len(group)
     return [

@@ -49,10 +49,8 @@ def _parser() -> argparse.ArgumentParser:
     epilog = f"The probes, and what a failure means:\n{probes}"
     parser = parser_of("check", __doc__, epilog=epilog)
     option = parser.add_argument
-    kinds = (
-        "a train function, e.g. my_agent:train, a class like SB3's, e.g. my_package.MyPPO, or a shipped agent"
-    )
-    option("algorithm", help=f"{kinds}, e.g. dqn")
+    kinds = "my_agent:train, a function; my_package.MyPPO, a class like SB3's; or dqn, a shipped agent"
+    option("algorithm", help=kinds)
     argument = "an argument for it, e.g. learning_rate=0.001; may be repeated"
     option("--set", action="append", default=[], metavar="NAME=VALUE", help=argument)
     option("--probe", action="append", default=[], metavar="NAME", help="only this probe; may be repeated")

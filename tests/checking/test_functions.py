@@ -136,7 +136,7 @@ CAUGHT = {
     ("ppo", "gamma"): "discount",
     ("ppo", "truncated"): "truncation",
 }
-STEPS = {"dqn": 2000, "ppo": 4000}
+STEPS = {"dqn": 2000, "ppo": 3000}
 
 
 @pytest.mark.parametrize("kind", STEPS)
