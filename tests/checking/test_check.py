@@ -193,6 +193,6 @@ def test_their_values_are_those_that_the_page_tells(world: Mdp, gamma: float, q:
 def test_worlds_are_what_they_are_for() -> None:
     assert solved(expect.DELAY, 0.9).q[0] == pytest.approx([0.9**3, 0])
     assert solved(expect.SLIPPERY, 0.9).q[1, 1] == pytest.approx(0.8 / 0.82)
-    assert expect.END_LIKE_THE_START.number.tolist() == [0, 1, 0]  # its end looks like a live state
+    assert expect.END_LIKE_THE_START.number.tolist() == [0, 1, 0, 0]  # its ends look like a live state
     assert (expect.ENDLESS.max_episode_steps, expect.ENDLESS.terminal.any()) == (5, False)
     assert len({probe.name for probe in PROBES}) == len(PROBES)
