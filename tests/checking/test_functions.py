@@ -171,6 +171,7 @@ def test_the_fixture_of_pytest(tmp_path: Path) -> None:
     (tmp_path / "test_mine.py").write_text(PLUGIN)
     words = ["-m", "pytest", "-W", "error", "-p", "pytest_gridworld", "-p", "no:cacheprovider", "-q"]
     environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
+    environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # where it is installed, it is there already
     where: dict[str, Any] = {"cwd": tmp_path, "env": environment, "text": True, "capture_output": True}
     done = subprocess.run([sys.executable, *words], check=False, **where)
     assert "its best actions are [0], with regret 1 (2 seeds)\n" in done.stdout
