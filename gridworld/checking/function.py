@@ -143,7 +143,8 @@ class FunctionAgent:
             states[mdp.number[live]] = live
             part = [self._row(name, part, shown) for shown in self._context.observation.rows(states)]
             part = np.ravel(part) if all(len(row) == 1 for row in part) else part
-        table, form = as_numbers(name, part), _FORMS[name].format(size, mdp.num_actions)
+        table = as_numbers(name, part, "a function")
+        form = _FORMS[name].format(size, mdp.num_actions)
         if str(table.shape) not in form:
             raise InputError(f"{name}: has shape {table.shape}; must be {form}")
         states = np.full(mdp.num_states, live[0])

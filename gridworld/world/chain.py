@@ -285,15 +285,15 @@ def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
     return normalised
 
 
-def as_numbers(name: str, table: Any) -> FloatArray:
-    """A table as float64; refuses anything else. `name` is what messages call it."""
+def as_numbers(name: str, table: Any, others: str) -> FloatArray:
+    """A table as float64; refuses anything else. Messages call it `name`, and say what `others` it may be."""
     try:
         if table is None:  # which numpy takes for NaN
             raise TypeError
         return np.asarray(table, dtype=np.float64)
     except (TypeError, ValueError, RuntimeError):  # torch's, for a tensor with a gradient
         kind = type(table).__name__
-        raise InputError(f"{name}: {kind} is neither a model nor a table of numbers") from None
+        raise InputError(f"{name}: {kind} is neither {others} nor a table of numbers") from None
 
 
 def policy_of_table(mdp: Mdp, name: str, numbers: FloatArray, is_q: bool = False) -> FloatArray:
@@ -310,7 +310,7 @@ def policy_of_table(mdp: Mdp, name: str, numbers: FloatArray, is_q: bool = False
     if numbers.shape != (size, mdp.num_actions):
         either = "" if is_q else f"({size},) actions or "
         raise InputError(
-            f"{name}: has shape {numbers.shape}; this world has {size} states and "
+            f"{name}: has shape {numbers.shape}; {mdp.name} has {size} states and "
             f"{mdp.num_actions} actions, so it must be {either}({size}, {mdp.num_actions})"
         )
     if is_q:
