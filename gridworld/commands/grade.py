@@ -1,0 +1,46 @@
+"""Mark a student's notebook of a lab sheet: points and one sentence for each exercise, by exact ground truth.
+
+The notebook runs in a process of its own, with limits on time and memory, and away from other files and the network
+(Landlock). Exit code: 0 if it has all points, 1 if not, 2 for a mistake on the command line. Not protected against:
+a notebook that copies an answer from elsewhere, and attacks on the kernel itself; mark strangers' work in a container.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from gridworld.base.console import aligned, printable
+from gridworld.commands import parser_of, whole
+from gridworld.grading.sheet import find_sheet, grade
+
+_NOT_ALL = 1  # the exit code
+_COLUMNS = ("<34", ">7", "<0")
+
+
+def main(words: Sequence[str]) -> None:
+    """Print a row per exercise as it is marked, and the total."""
+    options = _parser().parse_args(words)
+    points = of = 0
+    for each in grade(find_sheet(options.sheet), options.solution, options.seconds, options.memory * 2**30):
+        if isinstance(each, str):
+            print(printable(each), flush=True)
+            continue
+        points, of = points + each.points, of + each.of
+        row = [each.title, f"{each.points}/{each.of}", f" {each.sentence}"]
+        print(printable(*aligned([row], _COLUMNS)), flush=True)
+    print(f"total: {points} of {of} points")
+    if points < of:
+        sys.exit(_NOT_ALL)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = parser_of("grade", __doc__)
+    option = parser.add_argument
+    option("sheet", metavar="SHEET", help="the number of a sheet in docs/course, or the path of its notebook")
+    option("solution", metavar="SOLUTION", type=Path, help="the student's notebook")
+    option("--seconds", type=whole(1), default=20, help="for each cell and each exercise (default 20)")
+    option("--memory", type=whole(1), default=4, help="GiB that the notebook may address (default 4)")
+    return parser
