@@ -140,7 +140,7 @@ def source_of(tree: Path) -> Source | None:
     def ask(*words: str, **variables: str) -> bytes:
         environment = {**os.environ, **variables, "GIT_OPTIONAL_LOCKS": "0"}
         command = ["git", "-C", str(tree), *words]
-        # A handler that raises between two steps of `run` would leave a lock taken that `run` itself waits for.
+        # A handler that raised within `run` could leave a lock taken for which `run` waits then.
         with blocking(signal.SIGINT, signal.SIGTERM):
             done = subprocess.run(
                 command, capture_output=True, check=True, timeout=_GIT_SECONDS, env=environment

@@ -282,10 +282,10 @@ def test_changes_since_the_commit_are_kept_and_can_be_applied(tmp_path: Path) ->
 
 
 def test_a_signal_waits_until_git_has_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A handler that raised in the middle of a call of git could leave a lock of `subprocess` taken for ever."""
+    """A handler that raised within `subprocess.run` could leave a lock taken for which it waits then."""
     (tmp_path / ".git").mkdir()
     fake = tmp_path / "git"
-    fake.write_text(f"#!/bin/sh\nkill -TERM $PPID\nsleep 0.2\ntouch answered\n")
+    fake.write_text("#!/bin/sh\nkill -TERM $PPID\nsleep 0.2\ntouch answered\n")
     fake.chmod(0o755)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
