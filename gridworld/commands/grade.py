@@ -1,8 +1,8 @@
 """Mark a student's notebook of a lab sheet: points and one sentence for each exercise, by exact ground truth.
 
-The notebook runs in a process of its own, with limits on time and memory, and away from other files and the network
-(Landlock). Exit code: 0 if it has all points, 1 if not, 2 for a mistake on the command line. Not protected against:
-a notebook that copies an answer from elsewhere, and attacks on the kernel itself; mark strangers' work in a container.
+The notebook runs in a process of its own, with limits on time and memory, away from other files and from TCP
+(Landlock, Linux 5.13 or newer). This does not protect against copied answers, or attacks on the kernel.
+Exit code: 0 if the notebook has all points, 1 if not, 2 for a mistake on the command line.
 """
 
 from __future__ import annotations

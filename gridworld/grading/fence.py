@@ -1,8 +1,8 @@
 """A student's process: it fences itself in, runs the cells that it is sent, and calls their functions.
 
-`work` starts this file as a script, in a folder that is removed afterwards. Every request and every reply is a line
-of JSON. Nothing here imports the package: the fence (Landlock, where the kernel has it) leaves out its folder and
-the course's, so that the solver and the solutions cannot be read, and so does `import`.
+`work` starts this file as a script, in a folder that is removed afterwards. Every request and every reply is
+a line of JSON. Nothing here imports the package: the fence (Landlock, where the kernel has it) leaves out its
+folder and the course's, so that the solver and the solutions cannot be read, and so does `import`.
 """
 
 import ast
@@ -123,7 +123,7 @@ def _limit(memory: int) -> None:
 
 
 def _fence(libc: Any, hidden: list[Path]) -> bool:
-    """Let this process read Python and the system only, write in its own folder only, and signal nobody else."""
+    """Let this process read Python and the system only, write in its own folder only, and signal nobody."""
     abi = libc.syscall(_CREATE_RULESET, None, 0, 1)
     if abi < 1:
         return False

@@ -1,8 +1,8 @@
 """A lab sheet: where its marking is, and the points of a student's notebook.
 
-The marking of `lab1_values.ipynb` is `marking/lab1_values.py` next to it: a function for each exercise, decorated
-with `exercise`. It asks the student's functions through `Work`, compares in its own process, and returns a sentence
-for full points or raises `WrongAnswerError` for none.
+The marking of `lab1_values.ipynb` is `marking/lab1_values.py` next to it: a function for each exercise,
+decorated with `exercise`. It asks the student's functions through `Work`, compares in its own process, and
+returns a sentence for full points or raises `WrongAnswerError` for none.
 """
 
 from __future__ import annotations
@@ -95,8 +95,7 @@ def read_cells(notebook: Path) -> dict[int, str]:
         raise InputError(f"{notebook}: must be a Jupyter notebook of format 4, with a list of cells")
     sources = [cell.get("source", "") for cell in cells if cell.get("cell_type") == "code"]
     texts = [source if isinstance(source, str) else "".join(map(str, source)) for source in sources]
-    graded = {number: text for number, text in enumerate(texts, 1) if not text.startswith(NOT_GRADED)}
-    return graded
+    return {number: text for number, text in enumerate(texts, 1) if not text.startswith(NOT_GRADED)}
 
 
 def grade(sheet: Path, notebook: Path, seconds: float, memory: int) -> Iterator[Marked | str]:

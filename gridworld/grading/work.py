@@ -1,7 +1,7 @@
 """A student's notebook in a process of its own, asked by plain data over a pipe.
 
-What comes back is untrusted: it is read as JSON within bounds, never unpickled, and compared in this process. The
-process has limits on memory and time (`fence`), and what it has started ends with it.
+What comes back is untrusted: it is read as JSON within bounds, never unpickled, and compared in this process.
+The other process has limits on memory and time (`fence`), and what it has started ends with it.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ class Work:
     def call(self, function: str, *arguments: Any) -> Any:
         """Call a function with numbers, text, lists, arrays and worlds.
 
-        A world arrives with its tables as attributes: `next_state`, `probability`, `reward`, `terminal`, `start`,
-        `num_states` and `num_actions`, as an `Mdp` has them.
+        A world arrives with its tables as attributes: `next_state`, `probability`, `reward`, `terminal`,
+        `start`, `num_states` and `num_actions`, as an `Mdp` has them.
 
         Returns:
             What it returned, as plain data: arrays are lists.
@@ -160,7 +160,9 @@ class Work:
             raise WrongAnswerError(f"{what} ended its process: it exited, crashed or had no memory") from None
         except InputError:
             self._end()
-            raise WrongAnswerError(f"{what} gave an answer other than finite numbers, text or lists of them") from None
+            raise WrongAnswerError(
+                f"{what} gave an answer other than finite numbers, text and lists"
+            ) from None
 
     def _transfer(self, request: bytes) -> bytes:
         """Write a line to the process and read one; raises `TimeoutError` at the deadline."""
