@@ -87,7 +87,7 @@ class RunResult:
 
     @cached_property
     def policy(self) -> PolicySnapshot:
-        """What was learnt, as tables `greedy` (S,), `sampled` (S, A), `values` (S,), `q` (S, A) or None."""
+        """What was learned, as tables `greedy` (S,), `sampled` (S, A), `values` (S,), `q` (S, A) or None."""
         return self.agent.snapshot()
 
     @property

@@ -122,7 +122,7 @@ class Trained:
     mdp: Mdp
     gamma: float
     first: PolicySnapshot  # what it had before training
-    last: PolicySnapshot  # what it has learnt
+    last: PolicySnapshot  # what it has learned
     greedy: FloatArray  # (S, A), its own deterministic policy
     visits: IntArray  # (S, A), its actions in training
     late: IntArray  # (S, A), those in the last two fifths of it
@@ -157,7 +157,7 @@ def optimal_with_values(trained: Trained) -> str:
     return f"{optimal(trained)}, {values(trained)}"
 
 
-def acts_as_learnt(trained: Trained) -> str:
+def acts_as_learned(trained: Trained) -> str:
     """At the end of training nearly all its actions are optimal."""
     best = solved(trained.mdp, trained.gamma).optimal
     steps = int(trained.late.sum())
@@ -243,7 +243,7 @@ _NO_EXPLORATION_LEFT = {"exploration_final_eps": 0.0}
 # fmt: off
 PROBES = (
     Probe("constant", CONSTANT, values,
-          "values are not learnt at all: check the loss, the optimiser and the reward that reaches it"),
+          "values are not learned at all: check the loss, the optimiser and the reward that reaches it"),
     Probe("discount", CORRIDOR, values,
           "gamma is ignored or applied at the wrong step, or a reward is credited to another step",
           gamma=0.5),
@@ -252,8 +252,8 @@ PROBES = (
     Probe("context", TWO_CONTEXTS, optimal,
           "the policy does not depend on the state: observations are lost, mixed up or from another step",
           arguments=_NO_EXPLORATION_LEFT),
-    Probe("behaviour", TWO_CONTEXTS, acts_as_learnt,
-          "it does not act as it has learnt: exploration ends late or never, or acting and learning see "
+    Probe("behaviour", TWO_CONTEXTS, acts_as_learned,
+          "it does not act as it has learned: exploration ends late or never, or acting and learning see "
           "different observations",
           arguments=_NO_EXPLORATION_LEFT),
     Probe("layers", TWO_CONTEXTS, all_layers_learn,

@@ -36,7 +36,8 @@ COMMANDS = {
     "benchmark": "measure the speed of this project and its peers",
 }
 _MANUAL = """\
-A Stable-Baselines3 experiment harness whose ground truth is known.
+Train Stable-Baselines3 agents on worlds small enough to solve exactly, and know
+whether they are optimal, and if not, why.
 
 usage: {console} COMMAND ...
 

@@ -108,10 +108,9 @@ def completed(words: Sequence[str]) -> list[str]:
     values = [found[number] for number in places]
     if {word.partition("=")[0] for word in found} & _NO_SINGLE_RUN or not (own or may_need_preset(values)):
         return found
-    folders = search_path([conf_folder()] if own else [])
     chosen: list[str] = []
     with contextlib.suppress(Exception):  # Hydra composes again, and says what is wrong
-        chosen = compose_run([*own, conf_folder()][0], [*folders, *values])[2]
+        chosen = compose_run(conf_folder(), [*search_path(own), *values])[2]
     end = places[-1] + 1 if places else len(found)  # options may follow
     return [*found[:end], *chosen, *found[end:]]
 

@@ -326,8 +326,8 @@ def _task(task: str, groups: list[Group], seed: int, log_steps: bool) -> TaskAna
     runs = [run for group in groups for run in group.runs]
     world = _reference(next((run for run in runs if not run.damage), runs[0]))
     ends = [max(run.steps for run in group.runs) for group in groups]
-    learnt = [float(np.median([run.first_certified_step for run in group.runs])) for group in groups]
-    for steps in (ends, learnt):  # whether one agent ran, or learnt, ten times as long as another
+    learned = [float(np.median([run.first_certified_step for run in group.runs])) for group in groups]
+    for steps in (ends, learned):  # whether one agent ran, or learned, ten times as long as another
         known = [step for step in steps if 0 < step < math.inf]
         log_steps |= bool(known) and max(known) >= _SLOWER * min(known)
     grid = _grid(runs, log_steps)

@@ -103,7 +103,7 @@ class SavedRun:
         return agent
 
     def steps(self) -> int:
-        """The environment steps that the agent has learnt for."""
+        """The environment steps that the agent has learned for."""
         steps = self.run.read_summary().get(self._steps)
         if not isinstance(steps, int) or isinstance(steps, bool) or steps < 0:
             raise InputError(

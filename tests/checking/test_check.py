@@ -104,7 +104,7 @@ def test_two_of_three_seeds_decide(
 
 
 def trained(q: np.ndarray) -> Trained:
-    """A learner of Q on the alternation, which acts as it has learnt."""
+    """A learner of Q on the alternation, which acts as it has learned."""
     mdp = expect.ALTERNATION
     greedy = q.argmax(axis=1)
     last = PolicySnapshot(greedy, one_hot_policy(greedy, 2), q.max(axis=1), q)
@@ -123,7 +123,7 @@ def test_expectations_have_a_tolerance_and_tell_what_is_farthest() -> None:
         (expect.values, far, r"^Q\(1, 0\) 2.512, exact 2.222, tolerance 0.28$"),
         (expect.values, exact * np.nan, "nan"),
         (expect.optimal, -exact, r"its best actions are \[0, 0\], with regret 2.22"),
-        (expect.acts_as_learnt, exact, "50% of its last actions"),
+        (expect.acts_as_learned, exact, "50% of its last actions"),
         (expect.all_layers_learn, exact, r"^a.bias did not change$"),
     ):
         with pytest.raises(expect.UnmetError, match=words):
@@ -159,7 +159,7 @@ def test_the_command_ends_with_0_or_1(capsys: pytest.CaptureFixture[str]) -> Non
     assert ended.value.code == 1
     told = capsys.readouterr().out
     assert "constant     FAILED" in told
-    assert "\n    values are not learnt at all" in told
+    assert "\n    values are not learned at all" in told
     assert "failed 1 of 1 probes (constant)" in told
 
 

@@ -84,12 +84,12 @@ def test_asking_imports_nothing_heavy(command: str, tmp_path: Path) -> None:
     modules = {line.rsplit("|", 1)[1].strip() for line in done.stderr.splitlines() if "|" in line}
     assert ("hydra" in modules) == ("train" in command)
     assert not modules & {"torch", "stable_baselines3", "gymnasium", "scipy", "pygame", "tensorboard"}
-    # A tabular agent's settings stand in one module with its arithmetic, and composing reads all settings.
+    # A tabular agent's settings are in one module with its arithmetic, and composing reads all settings.
     assert ("numpy" in modules) <= ("--cfg" in command)
 
 
 def test_evaluate_scores_again_exactly_and_by_sampling(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     evaluate.main([str(finished), "--episodes", "50"])
     output = capsys.readouterr().out
@@ -97,6 +97,9 @@ def test_evaluate_scores_again_exactly_and_by_sampling(
     value = next(line for line in output.splitlines() if line.strip().startswith("value"))
     assert float(value.split()[1]) == pytest.approx(summary["value"], abs=1e-4)
     assert "50 episodes" in output
+    monkeypatch.setenv("COLUMNS", "60")
+    evaluate.main([str(finished), "--episodes", "50", "--policy", "sampled"])
+    assert max(map(len, capsys.readouterr().out.split("on classic")[1].splitlines())) <= 60
 
     other = tmp_path / "other.txt"
     other.write_text("S....G\n......\n......\n......\n......\n")

@@ -84,6 +84,10 @@ def test_a_preset_is_chosen_alike_from_python_and_by_the_command(tmp_path: Path)
     assert "${" not in shown
     assert "preset: stochastic" in shown
     assert "total_timesteps: 24000000" in shown
+    (tmp_path / "mine" / "env").mkdir(parents=True)
+    (tmp_path / "mine" / "env" / "icy.yaml").write_text("slip: 0.1")
+    shown = script("train.py", "--cfg", "job", "--config-dir", "mine", "env=icy", cwd=tmp_path).stdout
+    assert "preset: stochastic" in shown
 
 
 def test_each_job_of_a_sweep_has_its_own_preset_and_a_line_says_so(tmp_path: Path) -> None:

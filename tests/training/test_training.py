@@ -150,7 +150,7 @@ def test_certificates_and_the_best_model() -> None:
 def test_the_model_of_an_evaluation_at_the_end_is_kept_for_a_longer_run() -> None:
     curve, _ = follow([False, True], "total_timesteps=20")
     assert (curve.best.step, curve.best.content) == (10, b"after snapshot 1")
-    agent: Any = Scripted(np.zeros(30), [])  # has learnt on meanwhile
+    agent: Any = Scripted(np.zeros(30), [])  # has learned on meanwhile
     longer = LearningCurve(curve.evaluator, agent, configure("total_timesteps=40"))
     longer.set_state(curve.get_state())
     longer.write_held_of_shorter_run()

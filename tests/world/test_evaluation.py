@@ -258,7 +258,7 @@ def test_it_is_said_with_what_would_be_right(words: str, said: str, right: str) 
     found = note(*words.split())
     assert found is not None
     assert found.startswith(said)
-    assert found.endswith(f"under evaluation.gamma=0.99, too much for a certificate; take {right}")
+    assert found.endswith(f"under evaluation.gamma=0.99, too much for a certificate; use {right}")
     assert note(*words.split(), right) is None
 
 

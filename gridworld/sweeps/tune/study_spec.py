@@ -257,7 +257,7 @@ def _distribution(key: str, dimension: DimensionConfig) -> BaseDistribution:
     if (effect := effect_of(key)) in _GIVEN:
         raise InputError(f"{key}: is part of the task, so it cannot be searched")
     if effect is not Effect.LEARNING:
-        raise InputError(f"{key}: does not affect what is learnt, so it cannot be searched")
+        raise InputError(f"{key}: does not affect what is learned, so it cannot be searched")
     if kind == "categorical":
         if not choices or len(set(map(json.dumps, choices))) < len(choices):
             raise InputError(f"{key}: type=categorical needs choices, a list of different values")
