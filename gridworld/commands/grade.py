@@ -23,16 +23,17 @@ _COLUMNS = ("<34", ">7", "<0")
 def main(words: Sequence[str]) -> None:
     """Print a row per exercise as it is marked, and the total."""
     options = _parser().parse_args(words)
-    points = of = 0
+    points = most = 0
     for each in grade(find_sheet(options.sheet), options.solution, options.seconds, options.memory * 2**30):
         if isinstance(each, str):
             print(printable(each), flush=True)
             continue
-        points, of = points + each.points, of + each.of
-        row = [each.title, f"{each.points}/{each.of}", f" {each.sentence}"]
+        exercise, given, sentence = each
+        points, most = points + given, most + exercise.points
+        row = [exercise.title, f"{given}/{exercise.points}", f" {sentence}"]
         print(printable(*aligned([row], _COLUMNS)), flush=True)
-    print(f"total: {points} of {of} points")
-    if points < of:
+    print(f"total: {points} of {most} points")
+    if points < most:
         sys.exit(_NOT_ALL)
 
 

@@ -34,16 +34,6 @@ class Exercise:
     mark: Callable[[Work], str]
 
 
-@dataclass(frozen=True)
-class Marked:
-    """The result of one exercise."""
-
-    title: str
-    points: int
-    of: int
-    sentence: str  # why
-
-
 def exercise(title: str, points: int) -> Callable[[Callable[[Work], str]], Exercise]:
     """Make a function the marking of an exercise.
 
@@ -98,7 +88,7 @@ def read_cells(notebook: Path) -> dict[int, str]:
     return {number: text for number, text in enumerate(texts, 1) if not text.startswith(NOT_GRADED)}
 
 
-def grade(sheet: Path, notebook: Path, seconds: float, memory: int) -> Iterator[Marked | str]:
+def grade(sheet: Path, notebook: Path, seconds: float, memory: int) -> Iterator[str | tuple[Exercise, int, str]]:
     """Mark a student's notebook.
 
     Args:
@@ -108,7 +98,7 @@ def grade(sheet: Path, notebook: Path, seconds: float, memory: int) -> Iterator[
         memory: bytes that the student's process may address.
 
     Yields:
-        Notes on cells that failed, then the result of each exercise.
+        Notes on cells that failed, then each exercise with its points and the sentence that says why.
 
     Raises:
         InputError: a file that is missing or is not what it must be.
@@ -120,8 +110,7 @@ def grade(sheet: Path, notebook: Path, seconds: float, memory: int) -> Iterator[
             yield "this system has no Landlock (Linux 5.13): the notebook can read your files"
         yield from (f"code cell {number} {why}" for number, why in work.failed.items())
         for each in exercises:
-            points, sentence = _mark(each, work)
-            yield Marked(each.title, points, each.points, sentence)
+            yield (each, *_mark(each, work))
 
 
 def _mark(each: Exercise, work: Work) -> tuple[int, str]:
