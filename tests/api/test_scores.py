@@ -10,7 +10,7 @@ import pytest
 from helpers.support import SHORT
 from sb3_contrib import QRDQN, TRPO, RecurrentPPO
 from stable_baselines3 import A2C, DQN, PPO
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 import gridworld
 from gridworld import InputError, compile_mdp, load
@@ -74,29 +74,6 @@ def test_models_of_plain_sb3(algorithm: Any, kind: str) -> None:
     assert 0 < random.outcome.goal < 1
 
 
-def test_a_model_that_sees_images() -> None:
-    env = gridworld.ImageObservation(gym.make(RAW), cell_size=9)
-    model = PPO("CnnPolicy", env, n_steps=64, seed=0)
-    rows = gridworld.make_vec_env(observation="image", cell_size=9).observation.table()
-    assert gridworld.evaluate(model, "classic") == gridworld.evaluate(by_predict(model, rows), "classic")
-
-
-def test_a_model_behind_wrappers_of_gymnasium_and_sb3() -> None:
-    def shifted() -> Any:
-        env = gridworld.CoordinateObservation(gym.make(RAW, mdp=WORLD))
-        return gym.wrappers.TransformObservation(env, lambda seen: seen * 0.5, env.observation_space)
-
-    vec_env = VecNormalize(DummyVecEnv([shifted, shifted]))
-    model = trained(PPO, vec_env)
-    rows = gridworld.make_vec_env(observation="coordinates", mdp=WORLD).observation.table() * 0.5
-    score = gridworld.evaluate(by_predict(model, vec_env.normalize_obs(rows)), WORLD)
-    assert gridworld.evaluate(model) == score
-    for training in (True, False):  # is left as it was
-        model.policy.set_training_mode(training)
-        gridworld.evaluate(model)
-        assert model.policy.training is training
-
-
 @pytest.mark.parametrize("agent", ["dqn", "ppo"])
 def test_a_run_scores_as_its_own_summary(agent: str) -> None:
     run = gridworld.train(*SHORT[agent], progress=False)
@@ -105,13 +82,6 @@ def test_a_run_scores_as_its_own_summary(agent: str) -> None:
         assert score.value == pytest.approx(summary["value"], abs=1e-6)
         assert score.outcome.goal == pytest.approx(summary["goal_probability"], abs=1e-6)
     assert gridworld.evaluate(run.policy.sampled, "classic").value == run.summary["sampled"]["value"]
-
-
-def test_a_table_of_a_run_scores_as_its_own_summary() -> None:
-    run = gridworld.train("agent=q_learning", "env=cliff", progress=False)
-    mdp = run.evaluator.mdp
-    assert gridworld.evaluate(q=run.model, env=mdp).value == run.summary["value"]
-    assert gridworld.evaluate(run.policy.sampled, mdp).value == run.summary["sampled"]["value"]
 
 
 def refused(*given: Any, **named: Any) -> str:

@@ -49,7 +49,7 @@ def test_every_choice_composes_and_could_train(
         config.agent.check(config)
         for part in dataclasses.fields(TrainConfig):
             assert not isinstance(getattr(config, part.name), dict)
-        if choice in COMPLETED:  # for the others see api/test_worlds.py
+        if choice in COMPLETED.keys() - {"enumerated"}:  # `own` is of it; others: api/test_worlds.py
             mdp = config.env.compile()
             assert make_observation(mdp, config.observation.kind).num_states == mdp.num_states
 
