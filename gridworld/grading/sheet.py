@@ -88,7 +88,10 @@ def read_cells(notebook: Path) -> dict[int, str]:
     return {number: text for number, text in enumerate(texts, 1) if not text.startswith(NOT_GRADED)}
 
 
-def grade(sheet: Path, notebook: Path, seconds: float, memory: int) -> Iterator[str | tuple[Exercise, int, str]]:
+Marked = tuple[Exercise, int, str]  # its points, and the sentence that says why
+
+
+def grade(sheet: Path, notebook: Path, seconds: float, memory: int) -> Iterator[str | Marked]:
     """Mark a student's notebook.
 
     Args:
@@ -98,7 +101,7 @@ def grade(sheet: Path, notebook: Path, seconds: float, memory: int) -> Iterator[
         memory: bytes that the student's process may address.
 
     Yields:
-        Notes on cells that failed, then each exercise with its points and the sentence that says why.
+        Notes on cells that failed, then the result of each exercise.
 
     Raises:
         InputError: a file that is missing or is not what it must be.
