@@ -94,18 +94,18 @@ def refused(*given: Any, **named: Any) -> str:
 @pytest.mark.parametrize(
     ("given", "named", "sentence"),
     [
-        (([1] * 29, "classic"), {}, "has shape (29,); this world has 30 states and 4 actions"),
+        (([1] * 29, "classic"), {}, "has shape (29,); classic has 30 states and 4 actions"),
         (([4] * 30, "classic"), {}, "state 0 has the action 4; must be 0 (up)"),
         (([0.5] * 30, "classic"), {}, "state 0 has the action 0.5"),
         ((np.ones((30, 4)), "classic"), {}, "not probability distributions; give Q values as q="),
         (
             (),
             {"q": [1] * 30, "env": "classic"},
-            "q: has shape (30,); this world has 30 states and 4 actions, so it must be (30, 4)",
+            "q: has shape (30,); classic has 30 states and 4 actions, so it must be (30, 4)",
         ),
         ((), {"q": np.full((30, 4), np.nan), "env": "classic"}, "q: contains NaN"),
         ((), {"env": "classic"}, "give either a model or table"),
-        (("abc", "classic"), {}, "str is neither a model nor a table of numbers"),
+        (("abc", "classic"), {}, "str is neither a model, an opened run nor a table of numbers"),
         (([1] * 30,), {}, "env: is required"),
         (([1] * 30, "nope"), {}, "env=nope: no such world"),
         (([1] * 30, 3), {}, "env: int contains neither a GridWorld"),

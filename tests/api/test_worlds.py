@@ -160,6 +160,10 @@ def test_a_run_is_scored_on_its_own_world() -> None:
         ),
         (lambda: gridworld.make_vec_env("river_swim", source="deep_sea"), "source: is not a setting of"),
         (lambda: gridworld.make_vec_env("taxi_v4", slip=0.1), "slip: is not a setting of env=taxi_v4"),
+        (
+            lambda: gridworld.make_vec_env("cliff", layout="four_rooms"),
+            "env=cliff, layout=four_rooms: are 2 w",
+        ),
         (lambda: gridworld.make_vec_env(slip=2), "slip=2.0: must be a probability"),
         (lambda: gridworld.make_vec_env(layout="nowhere"), "neither a shipped layout"),
         (lambda: gridworld.make_vec_env(observation="pixels"), "observation kind 'pixels': must be one_hot"),
