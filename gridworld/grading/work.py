@@ -123,7 +123,10 @@ class Work:
                 start_new_session=True,
             )
         self._until = time.monotonic() + _SECONDS_TO_START
-        self.fenced = bool(self._exchange("its process", self._settings).get("fenced"))
+        try:
+            self.fenced = bool(self._exchange("the notebook", self._settings).get("fenced"))
+        except WrongAnswerError as error:
+            raise InputError(f"{error}, before its first cell; give it more memory") from None
         for number, source in list(self._cells.items()):
             self._until = time.monotonic() + self._seconds
             try:
