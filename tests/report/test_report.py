@@ -542,7 +542,8 @@ def test_the_page_needs_nothing_else(written: Path) -> None:
     page = (written / "report.html").read_text()
     assert not re.search(r"<(script|link|iframe|object|embed|base)\b|\son\w+=|url\(|@import|https?://", page)
     links = re.findall(r'(?:src|href|srcset)="([^"]*)"', page)
-    assert all(link.startswith(("#", "data:image/svg+xml;base64,")) for link in links)
+    assert all(link.startswith(("#", "data:image/svg+xml;base64,", "playground.html#map=")) for link in links)
+    assert (written / "playground.html").is_file()
     for anchor in (link[1:] for link in links if link.startswith("#")):
         assert f'id="{anchor}"' in page
     for tag in ("section", "table", "tr", "td", "figure", "details", "div", "p", "ul", "li", "span"):
