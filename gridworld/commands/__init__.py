@@ -141,6 +141,8 @@ def _without_command(words: Sequence[str]) -> None:
         return
     close = difflib.get_close_matches(word.removesuffix(".py"), COMMANDS, n=1)
     advice = f"did you mean {CONSOLE} {close[0]}?" if close else f"it is one of {', '.join(COMMANDS)}"
+    if word == "sweep":
+        advice = f"a sweep is {CONSOLE} train -m"
     if not close and "=" in word:
         advice = f"settings come after a command: {CONSOLE} train {word}"
     raise InputError(f"{CONSOLE}: unknown command {word}; {advice}")

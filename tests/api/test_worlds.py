@@ -162,6 +162,10 @@ def test_a_run_is_scored_on_its_own_world() -> None:
         ),
         (lambda: gridworld.make_vec_env("river_swim", source="deep_sea"), "source: is not a setting of"),
         (lambda: gridworld.make_vec_env("taxi_v4", slip=0.1), "slip: is not a setting of env=taxi_v4"),
+        (
+            lambda: gridworld.make_vec_env("cliff", layout="four_rooms"),
+            "env=cliff, layout=four_rooms: are 2 w",
+        ),
         (lambda: gridworld.make_vec_env(slip=2), "slip=2.0: must be a probability"),
         (lambda: gridworld.make_vec_env(layout="nowhere"), "neither a shipped layout"),
         (lambda: gridworld.make_vec_env(observation="pixels"), "observation kind 'pixels': must be one_hot"),
@@ -284,18 +288,18 @@ def refused(*given: Any, **named: Any) -> str:
 @pytest.mark.parametrize(
     ("given", "named", "sentence"),
     [
-        (([1] * 29, "classic"), {}, "has shape (29,); this world has 30 states and 4 actions"),
+        (([1] * 29, "classic"), {}, "has shape (29,); classic has 30 states and 4 actions"),
         (([4] * 30, "classic"), {}, "state 0 has the action 4; must be 0 (up)"),
         (([0.5] * 30, "classic"), {}, "state 0 has the action 0.5"),
         ((np.ones((30, 4)), "classic"), {}, "not probability distributions; give Q values as q="),
         (
             (),
             {"q": [1] * 30, "env": "classic"},
-            "q: has shape (30,); this world has 30 states and 4 actions, so it must be (30, 4)",
+            "q: has shape (30,); classic has 30 states and 4 actions, so it must be (30, 4)",
         ),
         ((), {"q": np.full((30, 4), np.nan), "env": "classic"}, "q: contains NaN"),
         ((), {"env": "classic"}, "give either a model or table"),
-        (("abc", "classic"), {}, "str is neither a model nor a table of numbers"),
+        (("abc", "classic"), {}, "str is neither a model, an opened run nor a table of numbers"),
         (([1] * 30,), {}, "env: is required"),
         (([1] * 30, "nope"), {}, "env=nope: no such world"),
         (([1] * 30, 3), {}, "env: int contains neither a GridWorld"),

@@ -303,7 +303,7 @@ def test_runs_that_cannot_be_used_are_named_and_the_rest_reported(
             change(run, name, harm if isinstance(harm, str) else re.sub(*harm, text, count=1))
     folder = report_of(tmp_path, code=1)
     assert [row["seed"] for row in rows_of(folder / "tables" / "runs.csv")] == ["0"]
-    assert f"{len(DAMAGES)} runs are in no statistic" in (folder / "report.html").read_text()
+    assert f"{len(DAMAGES)} runs are not in the statistics" in (folder / "report.html").read_text()
     for number, (row, (_, _, words)) in enumerate(
         zip(rows_of(folder / "tables" / "not_counted.csv"), DAMAGES, strict=True)
     ):

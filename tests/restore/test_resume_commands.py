@@ -338,4 +338,4 @@ def test_scripts_listen_before_what_takes_time_to_import() -> None:
 )
 def test_only_settings_that_name_code_have_to_be_trusted(agent: dict[str, object], more: str) -> None:
     command = RunFolder(Path("runs/it")).resume_command({"agent": agent})
-    assert command == f"python scripts/train.py resume=runs/it{more}"
+    assert command == f"gridworld train resume=runs/it{more}"
