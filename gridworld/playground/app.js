@@ -262,7 +262,11 @@ function listen() {
   $("copy-command").onclick = event => copy(commandLine(), event.target);
   $("download").onclick = download;
   $("load").onchange = event => event.target.files[0] && loadFile(event.target.files[0]);
-  addEventListener("hashchange", () => isMap && location.hash !== `#${app.link}` && open(location.hash));
+  addEventListener("hashchange", event => {
+    const { hash } = new URL(event.newURL);
+    clearTimeout(app.linking);
+    if (isMap && hash !== `#${app.link}`) open(hash);
+  });
   addEventListener("resize", () => refresh());
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => refresh());
 }

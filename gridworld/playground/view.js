@@ -68,9 +68,10 @@ function stroke(ctx, path, colour, width) {
   ctx.stroke(path);
 }
 
-function write(ctx, text, x, y, colour, font, most) {
+function write(ctx, text, x, y, colour, font, most, halo) {
   ctx.font = `${font} ${FONT}`;
-  ctx.fillStyle = colour;
+  Object.assign(ctx, { fillStyle: colour, strokeStyle: halo, lineWidth: 4 });
+  if (halo) ctx.strokeText(text, x, y, most);
   ctx.fillText(text, x, y, most);
 }
 
@@ -103,7 +104,7 @@ function context(canvas) {
  */
 export function drawBoard(canvas, scene) {
   const { ctx, width } = context(canvas), colours = theme(), { map, quarter } = scene, c = width / map.cols;
-  const round = c >= 20 ? Math.min(5, c * 0.07) : 0, gap = c >= 12 ? 1 : 0.25, inks = [];
+  const round = c >= 20 ? Math.min(5, c * 0.07) : 0, gap = c >= 12 ? 1 : 0.25, inks = [], fills = [];
   const hasNumber = c >= 42 && !quarter, lift = hasNumber ? 0.09 * c : 0;
   const centre = s => [(s % map.cols + 0.5) * c, (Math.floor(s / map.cols) + 0.5) * c];
   const box = (s, inset) => {
@@ -114,7 +115,7 @@ export function drawBoard(canvas, scene) {
     const tile = map.tiles[s], [x, y] = centre(s), t = "#GTC".includes(tile) ? null : scene.fill.of(s);
     const plain = { colour: tile === "#" ? colours.wall : colours.cell, ink: colours.ink };
     const { colour, ink } = t === null ? plain : shade(scene.fill.palette, t);
-    inks.push(ink);
+    inks.push(ink), fills.push(colour);
     fill(ctx, box(s, gap), colour);
     const [top, bottom, wide] = [y - 0.3 * c, y + 0.28 * c, 0.3 * c];
     if (tile === "G") fill(ctx, line([[x, top], [x + wide, bottom], [x - wide, bottom]]), colours.goal);
@@ -132,7 +133,8 @@ export function drawBoard(canvas, scene) {
     const [x, y] = centre(s), actions = quarter && c >= 54 ? [] : scene.arrows(s), ring = circle(x, y - lift, c * 0.36);
     if (map.tiles[s] === "S" && !quarter) stroke(ctx, ring, "#fff", c * 0.06), stroke(ctx, ring, AGENT, c * 0.035);
     for (const a of actions) fill(ctx, arrow(x, y - lift, a, c, actions.length === 1), quarter ? "#fff" : inks[s]);
-    if (hasNumber) write(ctx, scene.number(s), x, y + 0.35 * c, inks[s], `600 ${Math.min(15, c * 0.2)}px`, c * 0.92);
+    const font = `600 ${Math.min(15, c * 0.2)}px`;
+    if (hasNumber) write(ctx, scene.number(s), x, y + 0.35 * c, inks[s], font, c * 0.92, fills[s]);
     const frame = Math.max(1.5, c * 0.05);
     if (scene.wrong(s)) stroke(ctx, box(s, gap + frame / 2), colours.wrong, frame);
   }
