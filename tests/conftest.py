@@ -83,10 +83,12 @@ LONG = (
     *("report/test_report.py", "config/test_config.py", "commands/test_bad_input.py"),
     *("commands/test_commands.py", "process/test_output.py"),
     *("diagnosis/test_sabotage.py", "restore/test_reproduce.py", "restore/test_resume.py"),
-    *("checking/test_check.py", "restore/test_resume_commands.py", "commands/test_train_on_worlds.py"),
+    *("checking/test_check.py", "checking/test_functions.py", "restore/test_resume_commands.py"),
+    "commands/test_train_on_worlds.py",
     *("export/test_export.py", "training/test_training.py"),
     *("agents/sb3/test_custom_code.py", "engine/test_updates.py", "restore/test_resume_states.py"),
     *("commands/test_console.py", "docs/test_examples.py", "config/test_presets.py"),
+    *("grading/test_course.py", "grading/test_grade.py"),
     *("agents/tabular/test_tabular.py", "process/test_forks.py", "api/test_runs.py", "api/test_sweeps.py"),
 )
 
