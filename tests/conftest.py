@@ -74,11 +74,12 @@ def refusal(
 IN_TURN = {
     "clusters": ("sweep/test_sweep_cluster.py", "sweep/test_sweep_kills.py"),
     "browsers": ("training/test_tensorboard.py", "report/test_report_page.py"),
+    "playground": ("playground/test_numbers.py", "playground/test_page.py"),
 }
 # What takes more than ten seconds of a processor, the longest first.
 LONG = (
     *("clusters", "tests/test_docs.py", "sweep/test_sweep_population.py", "sweep/test_sweep.py"),
-    *("tune/test_tune.py", "browsers", "config/test_recipes.py", "tune/test_tune_parts.py"),
+    *("tune/test_tune.py", "browsers", "playground", "config/test_recipes.py", "tune/test_tune_parts.py"),
     *("commands/test_hostile_runs.py", "engine/test_populations.py", "api/test_certificates.py"),
     *("report/test_report.py", "config/test_config.py", "commands/test_bad_input.py"),
     *("commands/test_commands.py", "process/test_output.py"),

@@ -216,6 +216,8 @@ class Chain:
             among = coo_array(self.transition[endless][:, endless])
             _, label = connected_components(among, directed=True, connection="strong")
             leaving = label[among.row][label[among.row] != label[among.col]]
+            to_rest = self.transition[endless][:, np.flatnonzero(self.mdp.absorbing)].sum(axis=1) > 0
+            leaving = np.concatenate([leaving, label[to_rest]])
             recurrent[endless] = np.where(np.isin(label, leaving), 0, label + 1)
         return recurrent
 
