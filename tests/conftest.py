@@ -89,6 +89,7 @@ LONG = (
     *("export/test_export.py", "training/test_training.py"),
     *("agents/sb3/test_custom_code.py", "engine/test_updates.py", "restore/test_resume_states.py"),
     *("commands/test_console.py", "docs/test_examples.py", "config/test_presets.py"),
+    *("grading/test_course.py", "grading/test_grade.py"),
     *("agents/tabular/test_tabular.py", "process/test_forks.py", "api/test_runs.py", "api/test_sweeps.py"),
 )
 

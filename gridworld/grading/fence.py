@@ -41,11 +41,11 @@ def main() -> None:
     """Answer requests until there are no more. The first has the settings."""
     with socket.socket(fileno=os.dup(0)) as connection, connection.makefile("rwb") as lines:
         os.dup2(1, 0)
-        settings = json.loads(lines.readline())
+        request = json.loads(lines.readline())
         libc = ctypes.CDLL(None)
         libc.prctl(_DIE_WITH_PARENT, signal.SIGKILL, 0, 0, 0)
         for what, most in (
-            (resource.RLIMIT_AS, settings["memory"]),
+            (resource.RLIMIT_AS, request["memory"]),
             (resource.RLIMIT_CPU, _CPU_SECONDS),
             (resource.RLIMIT_FSIZE, _FILE_SIZE),
             (resource.RLIMIT_NOFILE, _FILES),
@@ -54,22 +54,24 @@ def main() -> None:
             hard = resource.getrlimit(what)[1]
             most = most if hard == resource.RLIM_INFINITY else min(most, hard)
             resource.setrlimit(what, (most, most))
-        reply = json.dumps({"fenced": _fence(libc, [*map(Path, settings["hidden"])])})
+        reply: dict[str, Any] = {"fenced": _fence(libc, [*map(Path, request["hidden"])])}
         sys.addaudithook(_refuse)
         notebook = sys.modules["__main__"] = ModuleType("__main__")
         while True:
-            lines.write(reply.encode() + b"\n")
+            lines.write(json.dumps({"number": request["number"], **reply}).encode() + b"\n")
             lines.flush()
-            if not (request := lines.readline()):
+            if not (line := lines.readline()):
                 return
+            request = json.loads(line)
             try:
-                reply = json.dumps({"result": _answer(vars(notebook), json.loads(request))})
+                reply = {"result": _answer(vars(notebook), request)}
+                json.dumps(reply)  # which fails for what is not plain
             except NotImplementedError:
-                reply = json.dumps({"error": "is not done yet"})
+                reply = {"error": "is not done yet"}
             except _MissingError:
-                reply = json.dumps({"error": "is not in the notebook"})
+                reply = {"error": "is not in the notebook"}
             except BaseException as error:
-                reply = json.dumps({"error": f"raised {type(error).__name__}: {error}"[:300]})
+                reply = {"error": f"raised {type(error).__name__}: {error}"[:300]}
 
 
 def _answer(names: dict[str, Any], request: dict[str, Any]) -> Any:

@@ -112,10 +112,11 @@ class Work:
         """Start the process and run the cells; a cell that has to be stopped is left out the next time."""
         self._folder = tempfile.TemporaryDirectory(prefix="gridworld-", ignore_cleanup_errors=True)
         self._socket, theirs = socket.socketpair()
+        self._received, self._number = b"", 0
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-I", "-B", str(Path(__file__).with_name("fence.py"))],
-                stdin=theirs,
+                stdin=theirs.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 cwd=self._folder.name,
@@ -151,18 +152,14 @@ class Work:
         """Send a request and read the reply; if that fails, the process is lost."""
         if self._process is None:
             raise WrongAnswerError(f"{what} could not be asked, since the notebook's process has ended")
-        reply = bytearray()
+        self._number += 1
         try:
             self._wait()
-            self._socket.sendall(json.dumps(request).encode() + b"\n")
-            while not reply.endswith(b"\n"):
-                self._wait()
-                reply += (part := self._socket.recv(2**16))
-                if not part:
-                    raise BrokenPipeError
-                if len(reply) > LARGEST_JSON:
-                    raise InputError("the reply is too large")
-            return as_object(bytes(reply), Path("the reply"))
+            self._socket.sendall(json.dumps({**request, "number": self._number}).encode() + b"\n")
+            while True:  # what else it may have sent is no reply
+                reply = as_object(self._line(), Path("the reply"))
+                if reply.get("number") == self._number:
+                    return reply
         except TimeoutError:
             why = f"took more than {self._seconds:g} s"
         except OSError:
@@ -171,6 +168,17 @@ class Work:
             why = "gave an answer other than finite numbers, text and lists"
         self._end()
         raise WrongAnswerError(f"{what} {why}")
+
+    def _line(self) -> bytes:
+        while b"\n" not in self._received:
+            self._wait()
+            self._received += (part := self._socket.recv(2**16))
+            if not part:
+                raise BrokenPipeError
+            if len(self._received) > LARGEST_JSON:
+                raise InputError("the reply is too large")
+        line, _, self._received = self._received.partition(b"\n")
+        return line
 
     def _wait(self) -> None:
         """Let the next call of the socket wait until the deadline."""

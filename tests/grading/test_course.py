@@ -35,6 +35,12 @@ WRONG: dict[str, list[tuple[str, str, str]]] = {
         ("visits(world, policy, gamma)[:, None] * policy * adv", "policy * adv", "3.4"),
         ('"total_timesteps": 180_000', '"total_timesteps": 8_192', "3.7"),
     ],
+    "lab4_planted_bug": [
+        ("reward, following, terminated)\n", "reward, following, terminated or truncated)\n", "4.2 4.5 4.6"),
+        ("    updates[state, action] += 1\n", "    updates[state, action] = 1\n", "4.3 4.5 4.6"),
+        ('"stochastic", "trap", ', '"stochastic", ', "4.1"),
+        ("return train(NeverTerminated(env),", "return train(env,", "4.6"),
+    ],
 }
 
 

@@ -75,7 +75,8 @@ def optimal_values(work: Work) -> str:
     for accuracy in (1e-6, 1e-3):
         for where, mdp, gamma in worlds():
             found = work.array("value_iteration", mdp, gamma, accuracy, shape=(mdp.num_states,))
-            compare("value_iteration", found, solved(mdp, gamma).v, f"{where}, where {accuracy:g} was asked for", accuracy)
+            asked = f"{where}, where {accuracy:g} was asked for"
+            compare("value_iteration", found, solved(mdp, gamma).v, asked, accuracy)
     return "as accurate as asked for in six worlds"
 
 
