@@ -15,7 +15,7 @@ from gridworld.base.errors import InputError
 from gridworld.config.compose import named_world
 from gridworld.envs.inspection import Task, task_of, world_of
 from gridworld.envs.vector_env import GridWorldVectorEnv
-from gridworld.world.chain import one_hot_policy
+from gridworld.world.chain import as_numbers, policy_of_table
 from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.mdp import FloatArray, Mdp
 
@@ -97,40 +97,11 @@ def evaluate(
             )
         policy = tables.greedy if deterministic or tables.sampled is None else tables.sampled
     else:
-        policy = _policy(task, name, model_or_table if q is None else q)
+        numbers = as_numbers(name, model_or_table if q is None else q, "a model, an opened run")
+        if np.isnan(numbers).any():
+            raise InputError(f"{name}: contains NaN")
+        policy = policy_of_table(mdp, name, _by_states(task, numbers), is_q=q is not None)
     return Evaluator(mdp, gamma, limit).score(policy)
-
-
-def _policy(task: Task, name: str, table: Any) -> FloatArray:
-    """A table as probabilities (S, A) by states; with the name `q` of Q values."""
-    mdp, is_q = task.mdp, name == "q"
-    try:
-        numbers: FloatArray = np.asarray(table, dtype=np.float64)
-    except (TypeError, ValueError, RuntimeError):  # torch's, for a tensor with a gradient
-        kind = type(table).__name__
-        raise InputError(f"{name}: {kind} is neither a model, an opened run nor a table of numbers") from None
-    if np.isnan(numbers).any():
-        raise InputError(f"{name}: contains NaN")
-    numbers, size = _by_states(task, numbers), mdp.num_states
-    if numbers.shape == (size,) and not is_q:
-        wrong = ~np.isin(numbers, np.arange(mdp.num_actions))
-        if wrong.any():
-            state = int(np.argmax(wrong))
-            raise InputError(
-                f"{name}: state {state} has the action {numbers[state]:g}; must be {mdp.action_choices()}"
-            )
-        return one_hot_policy(numbers.astype(np.int64), mdp.num_actions)
-    if numbers.shape != (size, mdp.num_actions):
-        either = "" if is_q else f"({size},) actions or "
-        raise InputError(
-            f"{name}: has shape {numbers.shape}; {mdp.name} has {size} states and "
-            f"{mdp.num_actions} actions, so it must be {either}({size}, {mdp.num_actions})"
-        )
-    if is_q:
-        return one_hot_policy(numbers.argmax(axis=1), mdp.num_actions)
-    if (numbers < 0).any() or (np.abs(numbers.sum(axis=1) - 1) > 1e-4).any():
-        raise InputError(f"{name}: its rows are not probability distributions; give Q values as q=...")
-    return numbers
 
 
 def _by_states(task: Task, numbers: FloatArray) -> FloatArray:

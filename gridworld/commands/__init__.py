@@ -31,7 +31,9 @@ COMMANDS = {
     "reproduce": "repeat a finished run and compare it bit for bit",
     "tune": "tune an agent's settings for a task, and confirm the winner",
     "check": "check an algorithm's implementation on worlds with known answers",
+    "grade": "mark a student's lab sheet of the course",
     "play": "play a world yourself, next to a trained agent if you like",
+    "playground": "draw worlds and watch tables learn, in the browser",
     "benchmark": "measure the speed of this project and its peers",
 }
 _MANUAL = """\
@@ -131,7 +133,7 @@ def _without_command(words: Sequence[str]) -> None:
     """Print the manual or the version."""
     word = words[0] if words else "--help"
     if word in ("--help", "-h", "help"):
-        commands = "\n".join(f"  {name:<11}{about}" for name, about in COMMANDS.items())
+        commands = "\n".join(f"  {name:<12}{about}" for name, about in COMMANDS.items())
         print(_MANUAL.format(console=CONSOLE, commands=commands))
         return
     if word == "--version":

@@ -114,11 +114,13 @@ def test_the_wheel_holds_what_it_takes_to_train(wheel: Path) -> None:
         for suffix in ("py", "txt", "j2", "yml", "typed")
         for path in package.rglob(f"*.{suffix}")
     }
-    assert ours - names == {"gridworld/sweeps/hydra_plugin.py"}  # where Hydra looks for it:
-    assert "hydra_plugins/gridworld_sweeper.py" in names
+    moved = {"gridworld/sweeps/hydra_plugin.py", "gridworld/checking/pytest_plugin.py"}
+    assert ours - names == moved  # where Hydra and pytest look for them:
+    assert {"hydra_plugins/gridworld_sweeper.py", "pytest_gridworld.py"} <= names
     assert {name.split("/")[0] for name in names} == {
         "gridworld",
         "hydra_plugins",
+        "pytest_gridworld.py",
         f"gridworld_sb3-{__version__}.dist-info",
     }
 
