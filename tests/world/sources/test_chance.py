@@ -19,6 +19,7 @@ from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 from gridworld.world.memoryless import cost_of_own_observation
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
+from gridworld.world.snapshots import Snapshots
 from gridworld.world.sources import beliefs
 from gridworld.world.sources.enumerated import enumerate_env
 from gridworld.world.sources.gymnasium_table import compile_gymnasium
@@ -264,6 +265,17 @@ def test_blackjack_with_few_cards_is_as_good_as_by_its_rules(
     assert ("observations stand for several of them" in mdp.truth) == sab
     assert mdp.own_observation is not None
     assert mdp.own_observation.shape == (mdp.num_states, 3)
+
+
+def test_hands_are_summed_up_only_as_the_known_source_reads_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = blackjack.BlackjackEnv()
+    assert Snapshots(env)._read_by is not None
+    assert Snapshots(type("Own", (blackjack.BlackjackEnv,), {})())._read_by is None
+    env.rounds = 3
+    assert Snapshots(env)._read_by is None
+    del env.rounds
+    monkeypatch.setattr(blackjack, "score", lambda hand: len(hand))
+    assert Snapshots(env)._read_by is None
 
 
 @pytest.mark.slow
