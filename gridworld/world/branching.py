@@ -89,23 +89,6 @@ class Branching:
         """Whether anything was decided in this run."""
         return self._place > 0
 
-    def script(self) -> list[int]:
-        """What was decided in this run; `follow` repeats it."""
-        return list(self._taken)
-
-    def follow(self, script: Sequence[int], step: Callable[[], Result]) -> Result:
-        """Run a step once, with these decisions."""
-        self._decisions, self._taken = [], []
-        self._place, self.run, self._is_running, self._script = 0, self.run + 1, True, list(script)
-        try:
-            return step()
-        finally:
-            self._is_running, self._script = False, []
-            if self._refused is not None:
-                raise self._refused
-
-    _script: Sequence[int] = ()
-
     def decide(self, weights: Weights) -> int:
         """The number of an outcome, drawn with these probabilities."""
         place = self._place
@@ -121,7 +104,7 @@ class Branching:
             if len(possible) == 1:
                 return possible[0]
             self._decisions.append(_Decision(weights, possible, self._probability()))
-            self._taken.append(self._script[place] if place < len(self._script) else 0)
+            self._taken.append(0)
         decision = self._decisions[place]
         if decision.weights is not weights and decision.weights != weights:
             if sum(map(bool, weights)) == 1:

@@ -173,9 +173,3 @@ def test_a_number_of_another_run_and_a_step_that_is_not_repeatable() -> None:
         outcomes(keeps)
     with pytest.raises(InputError, match="draws otherwise"):
         outcomes(lambda rng: (kept.append(0), rng.integers(2 + len(kept) % 2))[1])
-
-
-def test_a_script_repeats_a_run() -> None:
-    rng = Branching("env")
-    found = {result: rng.script() for _, result in rng.outcomes(lambda: _until(rng))}
-    assert [rng.follow(found[each], lambda: _until(rng)) for each in found] == list(found)
