@@ -160,6 +160,8 @@ class FunctionAgent:
             row, again = (np.ravel(part(shown)) for _ in range(2))
         except Exception as error:  # it may be anybody's code
             raise UnmetError(f"its {name} fails for {shown}: {in_short(error)}") from error
+        if row.dtype == object:  # such as an action and a state, as SB3's `predict` returns them
+            raise InputError(f"{name}: must return an action or numbers for {shown}, not {row}"[:200])
         if row.tobytes() != again.tobytes():
             raise InputError(f"{name}: draws at random; give the best action, or probabilities")
         return row

@@ -23,6 +23,7 @@ from gridworld.config.train import AgentConfig
 Outcomes = list[tuple[bool | None, str]]  # of one probe on each seed: see `Finding`
 SEEDS = 3  # of a probe that fails at first: it has failed if it fails on most of them
 _WIDTH = 100
+_BROKEN = "training failed"
 _WORDS = {True: "passed", False: "FAILED", None: "-"}
 
 
@@ -42,7 +43,7 @@ class Finding:
         seeds = "" if self.seeds == 1 else f" ({self.seeds} seeds)"
         cells = [self.name, _WORDS[self.passed], f"{self.seconds:.1f} s", f" {self.found}{seeds}"]
         (line,) = aligned([cells], ("<12", "<7", ">7", "<0"))
-        if self.passed is False:
+        if self.passed is False and not self.found.startswith(_BROKEN):
             line += "\n" + textwrap.indent(textwrap.fill(self.meaning, _WIDTH), " " * 4)
         return line
 
@@ -184,9 +185,9 @@ def _once(
     except ReturnedError:
         raise
     except UnmetError as unmet:
-        return [(False, str(unmet))] * len(probes)
-    except Exception as error:  # it may be anybody's code
-        return [(False, f"training failed: {in_short(error)}")] * len(probes)
+        return [(False, f"{_BROKEN}: {unmet}")] * len(probes)
+    except (Exception, SystemExit) as error:  # it may be anybody's code
+        return [(False, f"{_BROKEN}: {in_short(error)}")] * len(probes)
     outcomes: Outcomes = []
     for probe in probes:
         try:

@@ -107,7 +107,8 @@ def grade(sheet: Path, notebook: Path, seconds: float, memory: int) -> Iterator[
         InputError: a file that is missing or is not what it must be.
     """
     exercises, cells = read_exercises(sheet), read_cells(notebook)
-    with Work(cells, seconds, memory, [sheet.parent, COURSE, _PACKAGE]) as work:
+    checkout = COURSE.parents[1:2] if COURSE.is_dir() else ()  # whose tests and .git have solutions, too
+    with Work(cells, seconds, memory, [sheet.parent, _PACKAGE, *checkout]) as work:
         work.begin()
         if not work.fenced:
             yield "this system has no Landlock (Linux 5.13): the notebook can read your files"

@@ -67,6 +67,7 @@ export function refresh(all = !app.playing) {
   if (app.world) rescore();
   if (isMap) drawMap();
   if (app.world) showScore(all), showCurve();
+  else for (const id of ["regret", "value", "optimum", "verdict"]) $(id).textContent = id === "verdict" ? "" : "–";
   if (all) showControls(), showTexts();
   showCell();
 }

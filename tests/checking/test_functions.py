@@ -72,6 +72,7 @@ def test_forms_of_a_policy(policy: Any) -> None:
         ({"pi": [1, 0]}, r"a dictionary has policy or q, and may have values, but not \['pi'\]"),
         ({"values": [1, 0]}, "a dictionary has policy or q"),
         ("right", "str is neither"),
+        (lambda state: (1, None), r"must return an action or numbers for 0, not \[1 None\]"),
         (lambda state: int(RANDOM.integers(3)), "draws at random; give the best action, or probabilities"),
     ],
 )
@@ -83,15 +84,18 @@ def test_what_is_no_policy_is_refused(returned: Any, words: str) -> None:
 @pytest.mark.parametrize(
     ("train", "words"),
     [
-        (returns(lambda state: {}[state]), "its policy fails for 0: KeyError"),
-        (returns({"q": np.full((2, 3), np.nan)}), "its q has numbers that are not finite"),
+        (returns(lambda state: {}[state]), "training failed: its policy fails for 0: KeyError"),
+        (lambda env, steps, seed: sys.exit(), "training failed: SystemExit"),
+        (returns({"q": np.full((2, 3), np.nan)}), "training failed: its q has numbers that are not finite"),
         (lambda env, steps, seed: env.step(1), "training failed: RuntimeError: env.step() after the end"),
         (lambda env, steps, seed: env.reset() and env.step(3), "training failed: InputError: actions="),
     ],
 )
 def test_what_fails_is_a_finding(train: Callable[..., Any], words: str) -> None:
-    passed, text = found(train, "choice")
-    assert (passed, text[: len(words)]) == (False, words)
+    result = gridworld.check(train, probes=["choice"])
+    (finding,) = result.findings
+    assert (finding.passed, finding.found[: len(words)]) == (False, words)
+    assert finding.meaning not in str(result)  # which is about what it has learned
 
 
 def test_a_function_is_asked_what_it_shows() -> None:

@@ -28,6 +28,8 @@ WRONG: dict[str, list[tuple[str, str, str]]] = {
             "2.1 2.6",
         ),
         ("(0.0 if terminated else q[state].max())", "q[state].max()", "2.2"),
+        ("total + reward", "total + gamma * reward", "2.4 2.5"),
+        ("q[state, action] += alpha * (target - q[state, action])", "q[state, action] = target", "2.4 2.5"),
     ],
     "lab3_standing_still": [
         ('"sarsa": "epsilon"', '"sarsa": "exploration"', "3.6"),
@@ -110,6 +112,15 @@ def test_a_wrong_answer_costs_its_own_points(
     sheet: str, old: str, new: str, lost: str, tmp_path: Path
 ) -> None:
     assert list(points_lost(sheet, changed(sheet, old, new, tmp_path))) == lost.split()
+
+
+def test_a_right_answer_may_look_different(tmp_path: Path) -> None:
+    """Other types, Jupyter's `display`, and a seed with which SARSA learns a bad policy."""
+    fractions = "display(1)\nfrom fractions import Fraction\nVALUES_RIGHT = (Fraction(81, 100), 0.9, 1)"
+    right = changed("lab1_values", "VALUES_RIGHT = [0.81, 0.9, 1.0]", fractions, tmp_path)
+    assert points_lost("lab1_values", right) == {}
+    unlucky = changed("lab2_cliff", 'if algorithm == "sarsa":', 'if algorithm == "sarsa" and seed:', tmp_path)
+    assert points_lost("lab2_cliff", unlucky) == {}
 
 
 @pytest.mark.parametrize("sheet", SHEETS)

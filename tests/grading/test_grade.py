@@ -41,6 +41,7 @@ HOSTILE = {
     "import gridworld": "ImportError: gridworld cannot be imported",
     "import sys; sys.addaudithook = None; import gridworld": "ImportError",
     f"return open({str(ROOT / 'gridworld' / '__init__.py')!r}).read()": "PermissionError",
+    f"return open({str(ROOT / 'pyproject.toml')!r}).read()": "PermissionError",  # as .git, with all history
     "import os; os.kill(os.getppid(), 9)": "PermissionError",
     "import os; os.fork()": "no processes",
     "import subprocess; subprocess.run(['true'])": "no processes",

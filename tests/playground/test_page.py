@@ -181,8 +181,15 @@ def test_it_is_drawn_on_with_keys_and_read_aloud(page: Page) -> None:
     keys.click(browser.find_element("css selector", "#tools [value='#']")).click(cells[0]).perform()
     assert tiles(browser) == "#G.T"
     assert "there is no start" in message(browser)
+    shown = [browser.find_element("id", each).text for each in ("regret", "value", "optimum", "verdict")]
+    assert shown == [*"\u2013" * 3, ""]  # not those of the world before
     browser.find_element("id", "undo").click()
     assert (tiles(browser), message(browser)) == ("SG.T", "")
+    sizes = [browser.find_element("id", each) for each in ("rows", "cols")]
+    for size, typed in zip(sizes, ("0", "3"), strict=True):  # a refused number is taken back
+        size.send_keys(Keys.CONTROL + "a")
+        size.send_keys(typed + Keys.ENTER)
+    assert ([size.get_attribute("value") for size in sizes], tiles(browser)) == (["2", "3"], "SG..T.")
 
 
 def test_a_cell_says_why_and_an_episode_goes_step_by_step(page: Page) -> None:

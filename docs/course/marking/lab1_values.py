@@ -48,7 +48,8 @@ def by_hand(work: Work) -> str:
             raise WrongAnswerError(f"`{name}` must have three numbers")
         wrong = np.flatnonzero(np.abs(np.array(found, dtype=float) - exact) > 1e-5)
         if wrong.size:
-            raise WrongAnswerError(f"`{name}`: the value of state {wrong[0]} is not {found[wrong[0]]:.6g}")
+            state, given = wrong[0], found[wrong[0]]
+            raise WrongAnswerError(f"`{name}`: the value of state {state} is not {given:.6g} to within 1e-5")
     return "all six values are right"
 
 

@@ -57,17 +57,25 @@ def targets(work: Work, function: str, policy: np.ndarray | None) -> None:
             raise WrongAnswerError(f"the mean of `{function}` is not the exact backup after a step{ends}")
 
 
-def trained(work: Work, algorithm: str, alpha: float, episodes: int) -> Iterator[tuple[str, Mdp, np.ndarray]]:
+def trained(
+    work: Work, algorithm: str, alpha: float, episodes: int, seed: int = 0
+) -> Iterator[tuple[str, Mdp, np.ndarray]]:
     for rows, columns in SIZES:
         mdp = cliff(rows, columns)
-        found = work.call("train", mdp, algorithm, episodes, EPSILON, alpha, GAMMA, rows)
+        found = work.call("train", mdp, algorithm, episodes, EPSILON, alpha, GAMMA, seed)
         if not isinstance(found, list) or len(found) != 2 or np.shape(found[1]) != (episodes,):
             raise WrongAnswerError("`train` must return q and a list with the return of each episode")
         q = np.array(found[0], dtype=float)
         if q.shape != mdp.next_state.shape[:2]:
             raise WrongAnswerError(f"the q of `train` has the shape {q.shape}, must be (states, actions)")
-        if not max(found[1]) < 0:
-            raise WrongAnswerError("`train` has episodes that cost nothing; each step costs 1")
+        strange = [each for each in found[1] if each > -columns - 1 or each % 1]
+        if strange:
+            raise WrongAnswerError(
+                f"`train` has the return {strange[0]:.4g} at {mdp.name}, which no episode has; sum all its "
+                "rewards without a discount"
+            )
+        if np.any(work.call("train", mdp, algorithm, 1, EPSILON, 0.0, GAMMA, seed)[0]):
+            raise WrongAnswerError("`train` changes q with alpha = 0; q must begin with 0, and move by alpha")
         yield mdp.name, mdp, q
 
 
@@ -106,16 +114,19 @@ def q_learning(work: Work) -> str:
 
 @exercise("2.5 SARSA", points=3)
 def sarsa(work: Work) -> str:
-    for name, mdp, q in trained(work, "sarsa", alpha=0.1, episodes=2000):
-        best, edge = optimum_of_epsilon(mdp, GAMMA, EPSILON), solved(mdp, GAMMA).q
-        greedy = (np.eye(4)[table.argmax(axis=1)] for table in (best, edge, q))
-        online = [at_start(mdp, epsilon_greedy(table, EPSILON), GAMMA) for table in greedy]
-        lost = (online[0] - online[2]) / (online[0] - online[1])
-        if not lost <= 0.6:
-            raise WrongAnswerError(
-                f"at {name} its policy, exploring, falls {lost:.0%} as far short as on the edge"
-            )
-    return "its policies are close to the best that explore"
+    why = ""
+    for seed in range(3):  # it is noisy: 5 of 300 right trainings failed
+        for name, mdp, q in trained(work, "sarsa", alpha=0.1, episodes=2000, seed=seed):
+            best, edge = optimum_of_epsilon(mdp, GAMMA, EPSILON), solved(mdp, GAMMA).q
+            greedy = (np.eye(4)[table.argmax(axis=1)] for table in (best, edge, q))
+            online = [at_start(mdp, epsilon_greedy(table, EPSILON), GAMMA) for table in greedy]
+            lost = (online[0] - online[2]) / (online[0] - online[1])
+            if not lost <= 0.6:
+                why = f"at {name} its policy loses {lost:.0%} of what walking along the edge loses on-line"
+                break
+        else:
+            return "its policies are close to the best that explore"
+    raise WrongAnswerError(f"{why}, three times more than 60%")
 
 
 @exercise("2.6 on-line and greedy returns", points=4)
