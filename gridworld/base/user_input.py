@@ -165,6 +165,6 @@ def imported(where: str, path: Any) -> Any:
         raise InputError(f"{where}={path}: no module {error.name}; is its folder on PYTHONPATH?") from None
     except (ValueError, TypeError):  # no path at all
         return None
-    except Exception as error:  # a module of the user's own may raise anything
+    except (Exception, SystemExit) as error:  # a module of the user's own may raise anything
         what = f"{module} cannot be imported ({type(error).__name__}: {error})"
         raise InputError(f"{where}={path}: {what}") from error

@@ -84,6 +84,8 @@ def read_cells(notebook: Path) -> dict[int, str]:
     if not isinstance(cells, list) or not all(isinstance(cell, dict) for cell in cells):
         raise InputError(f"{notebook}: must be a Jupyter notebook of format 4, with a list of cells")
     sources = [cell.get("source", "") for cell in cells if cell.get("cell_type") == "code"]
+    if not all(isinstance(source, str | list) for source in sources):
+        raise InputError(f"{notebook}: has a code cell whose source is not text")
     texts = [source if isinstance(source, str) else "".join(map(str, source)) for source in sources]
     return {number: text for number, text in enumerate(texts, 1) if not text.startswith(NOT_GRADED)}
 

@@ -98,6 +98,13 @@ def test_what_fails_is_a_finding(train: Callable[..., Any], words: str) -> None:
     assert finding.meaning not in str(result)  # which is about what it has learned
 
 
+def test_a_module_that_exits_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "exiting.py").write_text("raise SystemExit")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match=r"exiting cannot be imported .SystemExit"):
+        gridworld.check("exiting:train")
+
+
 def test_a_function_is_asked_what_it_shows() -> None:
     exact = {"q": [[1, 1], [0, 0]]}
     assert found(returns(exact), "constant") == (True, "Q(0, 0) 1.000, exact 1.000")

@@ -116,6 +116,9 @@ def test_the_command(tmp_path: Path) -> None:
         done = script("grade.py", *words, cwd=tmp_path)
         assert (done.returncode, done.stdout) == (2, "")
         assert told in done.stderr
+    notebook(tmp_path, TWO, 5)  # type: ignore[arg-type]
+    done = script("grade.py", "sheet.ipynb", "mine.ipynb", cwd=tmp_path)
+    assert (done.returncode, "has a code cell whose source is not text" in done.stderr) == (2, True)
     (tmp_path / "marking" / "sheet.py").write_text("1 / 0")
     done = script("grade.py", "sheet.ipynb", "mine.ipynb", cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
