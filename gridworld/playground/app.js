@@ -62,7 +62,8 @@ function paint(state, tile) {
 function resize(rows, cols) {
   const old = app.map, count = rows * cols;
   if (!(rows >= 1 && cols >= 1 && count >= 2 && count <= MOST_CELLS && Math.max(rows, cols) <= MOST_SIDE))
-    return showControls(), say(`the map: must have from 2 to ${MOST_CELLS} cells, and at most ${MOST_SIDE} in a row or column`);
+    return say(`the map: must have from 2 to ${MOST_CELLS} cells, and at most ${MOST_SIDE} in a row or column`),
+      showControls();
   const tiles = Array.from({ length: count }, (_, s) => {
     const row = Math.floor(s / cols), col = s % cols;
     return row < old.rows && col < old.cols ? old.tiles[row * old.cols + col] : ".";

@@ -45,6 +45,8 @@ HOSTILE = {
     "import os; os.kill(os.getppid(), 9)": "PermissionError",
     "import os; os.fork()": "no processes",
     "import subprocess; subprocess.run(['true'])": "no processes",
+    "import _posixsubprocess as p; p.fork_exec()": "'NoneType' object is not callable",
+    "import sys; del sys.modules['_posixsubprocess']; import _posixsubprocess": "cannot be imported",
     "import ctypes; ctypes.CDLL(None).fork()": "no processes and native functions",
     "import os; open(f'/proc/{os.getppid()}/environ')": "PermissionError",
     "open('/tmp/gridworld-grade', 'w')": "PermissionError",
