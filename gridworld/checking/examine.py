@@ -269,12 +269,15 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
     over, cut = (int(which[steps.last].sum()) for which in (steps.terminated, steps.truncated))
     how = f"{over:,} terminated, {cut:,} truncated; step limit {seen.limit or 'unknown or none'}"
     yield "episodes", f"{len(lengths):,} of {lengths.min():,} to {lengths.max():,} steps, {how}"
-    yield "rewards", f"from {steps.reward.min():.4g} to {steps.reward.max():.4g}, mostly {seen.usual:.4g}"
+    rewards = f"from {steps.reward.min() + 0.0:.4g} to {steps.reward.max() + 0.0:.4g}"
+    is_dense = np.mean(steps.reward == seen.usual) < 0.5 and seen.reach is None
+    yield "rewards", rewards if is_dense else f"{rewards}, mostly {seen.usual + 0.0:.4g}"
     if seen.reach is not None:
         soonest = "" if seen.reach[1] is None else f", which is {seen.reach[1]:,} steps away"
         yield "random policy", f"comes to the reward in {seen.reach[0]:.3%} of episodes (exact){soonest}"
-    elif count := len(np.unique(steps.episode[steps.at_random])):
+    elif not is_dense and (count := len(np.unique(steps.episode[steps.at_random]))):
         hits = len(np.unique(steps.episode[steps.at_random & seen.paid]))
         low, high = wilson_interval(hits, count)
-        found = f"comes to it in {hits:,} of {count:,} episodes (95 % interval {low:.1%} to {high:.1%})"
-        yield "random policy", found.replace("it", "an end" if seen.usual < 0 else "the reward", 1)
+        what = "a better reward" if (steps.reward > seen.usual).any() else "an end"
+        interval = f"95 % interval {low:.1%} to {high:.1%}"
+        yield "random policy", f"comes to {what} in {hits:,} of {count:,} episodes ({interval})"

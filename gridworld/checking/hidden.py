@@ -22,11 +22,12 @@ _MOST_PAIRS = 200
 _MOST_INPUTS = 12  # numbers of an observation, and actions, of the regression
 _UNEXPLAINED = 0.2  # of the variance; the step before must explain three quarters of that
 _TIME, _RESET, _BEFORE = "the step count", "what is drawn at reset", "the step before"
+_PAST = "more of the past than the step before"
 _ADVICE = {
     _TIME: "add the time to the observation (gymnasium.wrappers.TimeAwareObservation).",
     _RESET: "show what reset() chooses, e.g. the place of the goal.",
     _BEFORE: "show what is missing, e.g. a velocity or the last action, or use FrameStackObservation.",
-    "something hidden": "show what is missing; a recurrent policy or stacked observations are second best.",
+    _PAST: "show what is missing; a recurrent policy or stacked observations are second best.",
 }
 
 
@@ -62,7 +63,7 @@ def _by_conflict(seen: Seen, pair: IntArray, outcome: IntArray, previous: IntArr
     inside = several[pair]
     if not inside.any() or _only_the_end_pays_differently(seen, pair, inside):
         return None
-    cause = "something hidden"
+    cause = _PAST
     by = {_TIME: steps.time, _RESET: steps.episode, _BEFORE: previous}
     if seen.replays.plays and all(each[0] == seen.replays.plays[0][0] for each in seen.replays.plays):
         del by[_RESET]  # other seeds change nothing

@@ -24,12 +24,10 @@ _LARGE_INPUT = 10.0  # root mean square of a number that is observed
 
 
 def _interface(seen: Seen) -> Iterator[EnvFinding]:
-    """What a step raises, what Gymnasium's checker says, and arrays that change later."""
-    first = "correct that first; it may be the cause of the rest."
-    is_known = not seen.replays.repeats or seen.steps.outside  # of which the checker says less
-    for reason in [seen.steps.failure, "" if is_known else seen.interface]:
-        if reason:
-            yield EnvFinding("interface", ERROR, f"{reason.rstrip('.')}.", first)
+    """What a step raises, and arrays that change later."""
+    if failure := seen.steps.failure:
+        advice = "correct that first; it may be the cause of the rest."
+        yield EnvFinding("interface", ERROR, f"{failure.rstrip('.')}.", advice)
     if count := seen.steps.changed:
         evidence = f"{count} of the first returned observations were changed by the next step."
         yield EnvFinding("interface", ERROR, evidence, "return a copy, e.g. self.state.copy().")
@@ -232,10 +230,20 @@ def _observation(seen: Seen) -> Iterator[EnvFinding]:
 
 def _markov(seen: Seen) -> Iterator[EnvFinding]:
     """Whether what follows is determined by the observation and the action."""
-    if not seen.is_constant and (found := hidden(seen)) is not None:
+    is_known = seen.is_constant or seen.replays.survivors
+    if not is_known and (found := hidden(seen)) is not None:
         yield EnvFinding("markov", WARNING, *found)
+
+
+def _checker(seen: Seen) -> Iterator[EnvFinding]:
+    """What Gymnasium's checker says, unless it is known better."""
+    known = seen.steps.failure or seen.steps.outside or not seen.replays.repeats
+    if seen.interface and not known:
+        advice = "correct that; gymnasium.utils.env_checker.check_env repeats the check."
+        yield EnvFinding("interface", WARNING, f"{seen.interface.rstrip('.')}.", advice)
 
 
 ALL: tuple[Callable[[Seen], Iterator[EnvFinding]], ...] = (
     *(_interface, _values, _seed, _ends, _actions, _reward, _scale, _discount, _observation, _markov),
+    _checker,
 )
