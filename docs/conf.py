@@ -10,6 +10,7 @@ import notebook
 import option_tables
 
 import gridworld
+from gridworld.playground.page import maps_page
 
 project = "gridworld"
 author = "the gridworld maintainers"
@@ -32,8 +33,9 @@ html_css_files = ["site.css"]
 
 
 def setup(app):
-    """Have the tables of options and the notebook filled in, and headings in docstrings set in bold."""
+    """Have options and the notebook filled in, docstrings' headings set in bold, the playground written."""
     app.connect("source-read", lambda app, name, source: fill(name, source))
+    app.connect("build-finished", lambda app, _: Path(app.outdir, "playground.html").write_text(maps_page()))
     app.connect("autodoc-process-docstring", lambda app, what, name, thing, options, lines: tidy(lines))
 
 

@@ -32,7 +32,9 @@ COMMANDS = {
     "tune": "tune an agent's settings for a task, and confirm the winner",
     "check": "check an algorithm's implementation on worlds with known answers",
     "examine": "examine an environment: why nothing learns in it",
+    "grade": "mark a student's lab sheet of the course",
     "play": "play a world yourself, next to a trained agent if you like",
+    "playground": "draw worlds and watch tables learn, in the browser",
     "benchmark": "measure the speed of this project and its peers",
 }
 _MANUAL = """\
@@ -132,7 +134,7 @@ def _without_command(words: Sequence[str]) -> None:
     """Print the manual or the version."""
     word = words[0] if words else "--help"
     if word in ("--help", "-h", "help"):
-        commands = "\n".join(f"  {name:<11}{about}" for name, about in COMMANDS.items())
+        commands = "\n".join(f"  {name:<12}{about}" for name, about in COMMANDS.items())
         print(_MANUAL.format(console=CONSOLE, commands=commands))
         return
     if word == "--version":
@@ -142,6 +144,8 @@ def _without_command(words: Sequence[str]) -> None:
         return
     close = difflib.get_close_matches(word.removesuffix(".py"), COMMANDS, n=1)
     advice = f"did you mean {CONSOLE} {close[0]}?" if close else f"it is one of {', '.join(COMMANDS)}"
+    if word == "sweep":
+        advice = f"a sweep is {CONSOLE} train -m"
     if not close and "=" in word:
         advice = f"settings come after a command: {CONSOLE} train {word}"
     raise InputError(f"{CONSOLE}: unknown command {word}; {advice}")

@@ -90,7 +90,8 @@ class RunFolder:
         """The command line that resumes the run; for settings that the user has `trusted`, it says so."""
         parts = {key: (trusted or {}).get(key) for key in ("agent", "callbacks")}  # that are built again
         trust = " trust=true" if any(foreign(parts)) else ""
-        return f"{command('train')} resume={shell_path(self.folder)}{trust}"
+        place = Path(os.path.normpath(users_folder() / self.folder))  # `resume` refuses ../runs/mine
+        return f"{command('train')} resume={shell_path(place)}{trust}"
 
 
 def shown(folder: Path) -> str:

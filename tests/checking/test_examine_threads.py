@@ -54,7 +54,7 @@ class Matching902(gym.Env[Any, Any]):
 
 
 class Bikes672(gym.Env[Any, Any]):
-    """Not told; it is done after `step_limit` steps, which it does not show, and shows raw numbers of bikes."""
+    """Not told; it is done after `step_limit` steps, which it does not show, and shows raw numbers."""
 
     action_space = Discrete(6)
     observation_space = Box(0.0, 20.0, (4,), np.float64)

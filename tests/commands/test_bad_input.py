@@ -30,6 +30,8 @@ YAMLS: dict[str, bytes] = {
     b"agent: {name: mine, algorithm: own_module.Mine}\n",
     "env/tagged.yaml": b"layout: !!python/object/apply:os.system [ls]\n",
     "env/misspelt.yaml": b"layuot: cliff\n",
+    "tune/misspelt.yaml": b"# @package tune.space\nagent.gamma: {type: float, lo: 0, high: 1}\n",
+    "tune/packless.yaml": b"agent.gamma: {type: float, low: 0, high: 1}\n",
     "own_module.py": b"1 / 0\n",
     "needy.py": b"import not_installed\n",
     "own_callbacks.py": b"from stable_baselines3.common.callbacks import BaseCallback\n"
@@ -76,6 +78,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         path = folder / ("maps" if name in MAPS else "conf") / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
+    (folder / "run").mkdir()
+    (folder / "run" / "manifest.json").touch()
     return folder
 
 
@@ -178,8 +182,16 @@ def test_slurm_is_started_where_it_is(
 
 @pytest.mark.parametrize(("line", "words"), table("commands/bad_input.txt", "the other scripts"))
 def test_the_other_scripts_refuse_too(
-    line: str, words: str, tmp_path: Path, refusal: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
+    line: str,
+    words: str,
+    files: Path,
+    tmp_path: Path,
+    refusal: Callable[[str], str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    places = {"{conf}": str(files / "conf"), "{run}": str(files / "run")}
+    for name, place in places.items():
+        line, words = line.replace(name, place), words.replace(name, place)
     for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.setenv(name, "")
     assert words in refusal(line)

@@ -15,7 +15,7 @@ from helpers.support import CONF, configure, script
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import read_object
 from gridworld.config.compose import compose_run, register_schemas, search_path
-from gridworld.config.recipe_file import harmless_words, overrides, with_recipe
+from gridworld.config.recipe_file import overrides, with_recipe, words_again
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import BuiltConfig
 from gridworld.sweeps.tune.study import write_recipe
@@ -157,7 +157,7 @@ def test_a_study_whose_recipe_is_elsewhere_is_refused(tmp_path: Path) -> None:
 
 REFUSED = {
     "hydra: {run: {dir: evil}}": ("hydra.run.dir=out", "winner.yaml: has an unknown key 'hydra'"),
-    "agent: {n_steps: 3}": ("-m agent=q_learning,sarsa", "agent.n_steps: no such setting in QLearningConfig"),
+    "agent: {n_steps: 3}": ("-m agent=q_learning,sarsa", "agent.n_steps: no such setting of QLearning"),
     "defaults: [{override /agent: mine}]": ("seed=1", "agent=mine: no such choice"),
     "evaluation: {stop_after: often}": ("seed=1", "'often' of type 'str' could not be converted to Integer"),
     "env: {slip: {a: 1}}": ("seed=1", "slip"),
@@ -179,7 +179,7 @@ def test_nothing_is_written_for_a_recipe_that_is_refused(
 def test_a_runs_own_command_line_is_the_same_made_of_its_settings(agent: str) -> None:
     words = [f"agent={agent}", "env=cliff", "seed=7", "evaluation.stop_after=null", *WINNERS[agent]]
     config = configure(*words)
-    again = list(harmless_words(words, config))
+    again = list(words_again(words, config))
     assert len(again) == len(words)
     assert configure(*again) == config
 
@@ -196,6 +196,6 @@ STRANGERS_WORDS = [
 def test_a_strangers_command_line_is_not_repeated() -> None:
     config = configure("agent=dqn", "seed=3")
     config.callbacks = [{"_target_": "os.system"}]
-    assert list(harmless_words(STRANGERS_WORDS, config)) == ["seed=3", "+agent.algorithm=DQN"]
+    assert list(words_again(STRANGERS_WORDS, config)) == ["seed=3", "+agent.algorithm=DQN"]
     config.env = BuiltConfig(builder="os.system")
-    assert list(harmless_words(["env.builder=a.b", "env=built"], config)) == ["env=built"]
+    assert list(words_again(["env.builder=a.b", "env=built"], config)) == ["env=built"]

@@ -20,6 +20,7 @@ PRINTED = {
     "exact_callback_with_plain_sb3.py": "the best model: regret 0.000, certified optimal: True",
     "score_your_own_table.py": "certified optimal",
     "family_of_worlds.py": "| all | 1 | 1 | 1 | 1 |",
+    "check_a_numpy_agent.py": "train: passed all 11 probes",
 }
 ARGUMENTS = {"family_of_worlds.py": ["dqn", "--pairs", "2", "--observations", "one_hot"]}
 

@@ -108,6 +108,8 @@ def test_wandb(place: Path) -> None:
 def test_wandb_while_it_trains(tmp_path: Path) -> None:
     """Two runs that train together, and an agent of SB3's own loop with W&B's callback."""
     callback = "callbacks=[{_target_: wandb.integration.sb3.WandbCallback, verbose: 0}]"
+    done = script("train.py", *SHORT["ppo"], callback, cwd=tmp_path)
+    assert "You must call wandb.init() before WandbCallback(); logging.wandb=true calls it" in done.stderr
     words = [*SHORT["ppo"], *NO_FILES, "logging.wandb=true"]
     for more in (
         ["-m", "seed=0,1", "hydra.sweep.dir=runs"],

@@ -7,6 +7,7 @@ import logging
 import math
 import os
 import re
+from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -541,7 +542,8 @@ def test_the_page_needs_nothing_else(written: Path) -> None:
     page = (written / "report.html").read_text()
     assert not re.search(r"<(script|link|iframe|object|embed|base)\b|\son\w+=|url\(|@import|https?://", page)
     links = re.findall(r'(?:src|href|srcset)="([^"]*)"', page)
-    assert all(link.startswith(("#", "data:image/svg+xml;base64,")) for link in links)
+    assert all(link.startswith(("#", "data:image/svg+xml;base64,", "playground.html#map=")) for link in links)
+    assert (written / "playground.html").is_file()
     for anchor in (link[1:] for link in links if link.startswith("#")):
         assert f'id="{anchor}"' in page
     for tag in ("section", "table", "tr", "td", "figure", "details", "div", "p", "ul", "li", "span"):
@@ -614,12 +616,12 @@ def test_a_studys_page_has_its_own_title_and_explains_its_medians(maker: Maker, 
     report = gather([tmp_path / "mine"])
     (tuning,) = report.tunings
     report = replace(report, tunings=(replace(tuning, sentence="by step 3 in the median"),))
-    page = render(report, {"classic": [], "": []})
+    page = render(report, defaultdict(list))
     assert "<title>Tuning dqn on classic, gridworld</title>" in page
     assert "<h1>Tuning dqn on classic</h1>" in page
     assert "half of the runs were certified for good" in page
     maker.write(tmp_path / "other", 5, 3000)
-    assert "<h1>ppo on classic</h1>" in render(gather([tmp_path]), {"classic": [], "": []})
+    assert "<h1>ppo on classic</h1>" in render(gather([tmp_path]), defaultdict(list))
 
 
 def test_a_readmes_table_is_replaced(maker: Maker, tmp_path: Path) -> None:

@@ -195,6 +195,8 @@ def test_a_run_is_made_longer_on_request_only_and_what_falls_over_training_is_to
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     begin(tmp_path, *SHORT["dqn"], *LESS, "agent.learning_rate=lin_0.004")
+    (older,) = Checkpoints(tmp_path).files()
+    content = older.read_bytes()
     with pytest.raises(InputError, match=r"is finished; to make it longer: .*=4000"):
         go_on(tmp_path)
     go_on(tmp_path, 4000)
@@ -202,11 +204,14 @@ def test_a_run_is_made_longer_on_request_only_and_what_falls_over_training_is_to
     assert "4,000 steps instead of 2,000; as in a run of that length: learning_rate, exploration_frac" in told
     with pytest.raises(InputError, match="it can be made longer, not shorter"):
         go_on(tmp_path, 3000)
-    assert manifest(tmp_path)["config"]["total_timesteps"] == 4000  # type: ignore[index]
+    go_on(tmp_path, 4500)
+    assert manifest(tmp_path)["config"]["total_timesteps"] == 4500  # type: ignore[index]
     for file in Checkpoints(tmp_path).files():
         file.write_bytes(b"")
-    with pytest.raises(InputError, match="was made longer after 2,048 steps and has no checkpoint left"):
+    older.write_bytes(content)
+    with pytest.raises(InputError, match="was made longer after 4,096 steps and has no checkpoint left"):
         go_on(tmp_path, 8000)
+    assert "skipped, it is older than the lengthening after 4,096 steps" in capsys.readouterr().err
 
 
 def test_another_environment_is_refused_or_noted(
@@ -338,4 +343,4 @@ def test_scripts_listen_before_what_takes_time_to_import() -> None:
 )
 def test_only_settings_that_name_code_have_to_be_trusted(agent: dict[str, object], more: str) -> None:
     command = RunFolder(Path("runs/it")).resume_command({"agent": agent})
-    assert command == f"python scripts/train.py resume=runs/it{more}"
+    assert command == f"gridworld train resume=runs/it{more}"

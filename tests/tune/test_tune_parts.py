@@ -183,6 +183,8 @@ def test_trials_and_seeds_that_train_together_are_those_that_train_one_by_one(
     assert [len(outcome.seeds) for outcome in outcomes] == [3, 0, 0, 1, 2]
     assert [outcome.value is None for outcome in outcomes] == [False, True, True, True, True]
     assert ["diverged" in outcome.error for outcome in outcomes] == [False, False, True, False, False]
+    twice = reported(Objective(base, (0,), 8, None), {0: RATES[0]})[1]  # as often as it is evaluated
+    assert [report.can_prune for report in twice] == [False, True] * 4
     whole = [report for report in reports if report.trial == 0]
     assert [report.step for report in whole] == list(range(12))
     assert whole[-1].value == pytest.approx(outcomes[0].value)
