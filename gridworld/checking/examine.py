@@ -261,7 +261,9 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
     kind = "stochastic" if seen.is_stochastic else "deterministic"
     yield "steps", f"{kind}; a seed {'repeats' if seen.replays.repeats else 'does not repeat'} an episode"
     states = "not enumerated; what follows is of a sample"
-    yield "states", states if mdp is None else f"{mdp.reachable.sum():,} can be reached ({mdp.truth.split(",")[0]})"
+    if mdp is not None:
+        states = f"{mdp.reachable.sum():,} can be reached ({mdp.truth.partition(',')[0]})"
+    yield "states", states
     starts = len(np.unique(steps.before[steps.first]))
     space = " ".join(str(seen.env.observation_space).split())[:60]
     met = f"{seen.observed:,} different ones in {len(steps.before):,} steps, {starts:,} at the start"
