@@ -22,7 +22,7 @@ from gridworld.base.console import aligned
 from gridworld.base.errors import InputError, in_short
 from gridworld.base.user_input import imported
 from gridworld.checking.sampling import Actions, Env, Replays, generators_restored, replays, sample
-from gridworld.checking.seen import EnvFinding, Seen
+from gridworld.checking.seen import ERROR, EnvFinding, Seen
 from gridworld.checking.symptoms import ALL
 from gridworld.config.compose import named_world
 from gridworld.envs.inspection import world_of
@@ -104,24 +104,22 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
         warnings.simplefilter("ignore")
         name, make, mdp = _subject(env)
         first = _made(name, make)
-        if problem := _first_look(first, make):
-            finding = EnvFinding(
-                "interface",
-                "error",
-                problem,
-                "follow gymnasium.Env; gymnasium.utils.env_checker.check_env says more.",
-            )
+        if problem := _first_look(first, make, seed):
+            advice = "follow gymnasium.Env; gymnasium.utils.env_checker.check_env says more."
+            finding = EnvFinding("interface", ERROR, problem, advice)
             return ExamineResult(name, (), (finding,), time.monotonic() - began)
         mdp = _exact(first, make) if mdp is None else mdp
+        started = time.monotonic()
         found = sample(make(), Actions(first.action_space, seed), steps, seed)
+        rate, replayed = len(found.before) / max(time.monotonic() - started, 1e-3), Replays()
         try:
-            replayed = replays(make, Actions(first.action_space, seed))
-        except Exception:  # a step that raises: `sample` says which
-            replayed = Replays()
+            replayed = replays(make, Actions(first.action_space, seed), rate)
+        except Exception as error:  # anybody's code
+            found.failure = found.failure or f"a replayed episode raises {in_short(error)}"
         limit = step_limit(first) or (None if mdp is None else mdp.max_episode_steps)
         seen = Seen(first, gamma, found, replayed, _interface(make), limit, mdp)
         findings = [finding for symptom in ALL for finding in symptom(seen)]
-        facts = tuple(_facts(seen)) if len(found.before) else ()
+        facts = tuple(_facts(seen))
     return ExamineResult(name, facts, tuple(findings), time.monotonic() - began)
 
 
@@ -167,16 +165,16 @@ def _made(name: str, make: Make) -> Env:
     return env
 
 
-def _first_look(env: Env, make: Make) -> str:
+def _first_look(env: Env, make: Make, seed: int) -> str:
     """What is wrong with the results of reset() and step(), a sentence; "" for nothing."""
-    call = "reset(seed=0)"
+    call, actions = "reset(seed=0)", Actions(env.action_space, seed).of_episode(0)
     try:
         result = make().reset(seed=0)
         if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
             return f"{call} returns {_kind(result)}, must be (observation, info)."
         env.reset(seed=0)
         call = "step()"
-        stepped: Any = env.step(Actions(env.action_space, 0).pool[0])
+        stepped: Any = env.step(next(actions))
         if not (isinstance(stepped, tuple) and len(stepped) == 5):
             five = "(observation, reward, terminated, truncated, info)"
             return f"{call} returns {_kind(stepped)}, must be {five}."

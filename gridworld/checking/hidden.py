@@ -46,7 +46,8 @@ def _numbers(*columns: IntArray | BoolArray) -> IntArray:
 def _outcomes(seen: Seen) -> tuple[IntArray, IntArray, IntArray]:
     """Of each step the pair (observation, action), what came of it, and the pair before, as numbers."""
     steps = seen.steps
-    ended = steps.terminated & (steps.time + 1 != seen.ends_at)
+    by_limit = (steps.time + 1 == seen.ends_at) & np.isin(steps.after, steps.before)
+    ended = steps.terminated & ~by_limit
     rewards = np.unique(np.round(steps.reward, 9), return_inverse=True)[1]
     pair, outcome = _numbers(steps.before, steps.action), _numbers(steps.after, rewards, ended)
     return pair, outcome, np.where(steps.time == 0, -1, np.append(-1, pair[:-1]))

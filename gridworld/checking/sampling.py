@@ -8,6 +8,7 @@ repeats with one seed and not with another draws from them.
 from __future__ import annotations
 
 import copy
+import itertools
 import random
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -32,7 +33,9 @@ _HORIZON = 100  # steps of a replay
 _POOL = 8  # actions that are held and repeated
 _MOST_HELD = 12  # steps for which one is held
 _WATCHED = 300  # first steps, in which returned arrays and generators are watched
-_SECONDS = 15.0
+_MOST_NUMBERS = 256  # of an observation; more, as of an image, are not looked at
+_SECONDS = 15.0  # for the sample
+_REPLAYED = 10.0  # seconds, for the replays; fewer steps where that is not enough
 
 
 @dataclass
@@ -183,10 +186,11 @@ def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
     )
 
 
-def replays(make: Callable[[], Env], actions: Actions) -> Replays:
+def replays(make: Callable[[], Env], actions: Actions, rate: float) -> Replays:
     """Replay actions in one environment, in a new one, and with other seeds of the shared generators."""
     found = Replays()
-    lists = [_first(actions.of_episode(kind), _HORIZON) for kind in (0, 1, 3)]
+    steps = int(np.clip(_REPLAYED * rate / (len(SEEDS) * (6 * 3 + _POOL)), 5, _HORIZON))
+    lists = [list(itertools.islice(actions.of_episode(kind), steps)) for kind in (0, 1, 3)]
 
     def plays(env: Env | None, shared: tuple[int, int], which: Sequence[list[Any]]) -> list[list[Play]]:
         random.seed(shared[0])
@@ -209,7 +213,7 @@ def replays(make: Callable[[], Env], actions: Actions) -> Replays:
         if new == newer and not own:
             found.survivors = _survivors(make, env)
     if base == new:
-        held = [[action] * _HORIZON for action in actions.pool]
+        held = [[action] * steps for action in actions.pool]
         held_plays = plays(None, (1, 1), held)
         found.plays = [one + two for one, two in zip(base, held_plays, strict=True)]
     return found
@@ -227,10 +231,6 @@ def _survivors(make: Callable[[], Env], used: Env) -> list[str]:
     except (UnreadableError, TypeError):
         return [""]
     return sorted(name for name in keys[0] | keys[1] if keys[0].get(name) != keys[1].get(name)) or [""]
-
-
-def _first(actions: Iterator[Any], count: int) -> list[Any]:
-    return [next(actions) for _ in range(count)]
 
 
 def _play(env: Env, actions: Sequence[Any], seed: int, shared: tuple[int, int]) -> Play:
@@ -291,6 +291,8 @@ def boxes(space: gym.Space[Any]) -> list[str | None]:
 
 def _vector(space: gym.Space[Any], observation: Any) -> FloatArray | None:
     parts = [observation if key is None else observation[key] for key in boxes(space)]
+    if sum(np.size(part) for part in parts) > _MOST_NUMBERS:
+        return None
     try:
         return np.concatenate([np.asarray(part, np.float64).ravel() for part in parts]) if parts else None
     except (TypeError, ValueError):
