@@ -104,6 +104,7 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
         warnings.simplefilter("ignore")
         name, make, mdp = _subject(env)
         first = _made(name, make)
+        name = type(first.unwrapped).__name__ if "<" in name else name  # of a lambda
         if problem := _first_look(first, make, seed):
             advice = "follow gymnasium.Env; gymnasium.utils.env_checker.check_env says more."
             finding = EnvFinding("interface", ERROR, problem, advice)
@@ -149,7 +150,9 @@ def _subject(env: Any) -> tuple[str, Make, Mdp | None]:
     if callable(env):
         return getattr(env, "__name__", type(env).__name__), env, None
     kind = type(env).__name__
-    raise InputError(f"examine: {kind} is not an environment; give one, a function that makes one, or a name")
+    raise InputError(
+        f"examine: {kind} is not a single environment; give one, a function that makes one, or a name"
+    )
 
 
 def _made(name: str, make: Make) -> Env:
@@ -267,17 +270,23 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
     met = f"{seen.observed:,} different ones in {len(steps.before):,} steps, {starts:,} at the start"
     yield "observations", f"{met}; {space}"
     over, cut = (int(which[steps.last].sum()) for which in (steps.terminated, steps.truncated))
-    how = f"{over:,} terminated, {cut:,} truncated; step limit {seen.limit or 'unknown or none'}"
+    limit = f"{seen.limit:,}" if seen.limit else "not known" if cut else "none seen"
+    how = f"{over:,} terminated, {cut:,} truncated; step limit {limit}"
     yield "episodes", f"{len(lengths):,} of {lengths.min():,} to {lengths.max():,} steps, {how}"
     rewards = f"from {steps.reward.min() + 0.0:.4g} to {steps.reward.max() + 0.0:.4g}"
-    is_dense = np.mean(steps.reward == seen.usual) < 0.5 and seen.reach is None
-    yield "rewards", rewards if is_dense else f"{rewards}, mostly {seen.usual + 0.0:.4g}"
+    is_usual = np.mean(steps.reward == seen.usual) >= 0.5 or seen.reach is not None
+    yield "rewards", f"{rewards}, mostly {seen.usual + 0.0:.4g}" if is_usual else rewards
+    at_random = steps.last[steps.at_random[steps.last]]
     if seen.reach is not None:
         soonest = "" if seen.reach[1] is None else f", which is {seen.reach[1]:,} steps away"
         yield "random policy", f"comes to the reward in {seen.reach[0]:.3%} of episodes (exact){soonest}"
-    elif not is_dense and (count := len(np.unique(steps.episode[steps.at_random]))):
+    elif is_usual and (seen.paid.any() or seen.usual <= 0) and len(at_random):
         hits = len(np.unique(steps.episode[steps.at_random & seen.paid]))
-        low, high = wilson_interval(hits, count)
-        what = "a better reward" if (steps.reward > seen.usual).any() else "an end"
+        low, high = wilson_interval(hits, len(at_random))
+        what = "an end" if (steps.reward <= seen.usual).all() and seen.usual < 0 else "a better reward"
         interval = f"95 % interval {low:.1%} to {high:.1%}"
-        yield "random policy", f"comes to {what} in {hits:,} of {count:,} episodes ({interval})"
+        yield "random policy", f"comes to {what} in {hits:,} of {len(at_random):,} episodes ({interval})"
+    else:
+        returns = np.bincount(steps.episode, steps.reward)[steps.episode[at_random]]
+        found = f"returns {returns.mean():.4g} on average (deviation {returns.std():.3g})"
+        yield "random policy", f"{found} in {len(at_random):,} episodes"

@@ -139,7 +139,7 @@ def _reward(seen: Seen) -> Iterator[EnvFinding]:
     """Whether a reward can be found, and depends on what is done."""
     steps, mdp, plays, reach = seen.steps, seen.mdp, seen.replays.plays, seen.reach
     advice = "pay for progress, start closer to the goal, or check the conditions of reward and goal."
-    values, has_ends = np.unique(steps.reward), steps.terminated.any()
+    values, has_ends = np.unique(steps.reward[np.isfinite(steps.reward)]), steps.terminated.any()
     if mdp is not None and reach is not None and reach[1] is None:
         values = np.unique(mdp.reward[mdp.acting][mdp.probability[mdp.acting] > 0])
         if mdp.goal.any() or (len(values) < 2 and not mdp.terminal[mdp.reachable].any()):

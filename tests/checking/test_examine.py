@@ -76,7 +76,7 @@ def test_the_command_ends_with_1_where_something_is_found(capsys: pytest.Capture
     ("env", "message"),
     [
         (Raises.step, "cannot be made"),
-        (3, "int is not an environment"),
+        (3, "int is not a single environment"),
         ("helpers.faulty_envs:Nobody", "has no Nobody"),
     ],
 )
