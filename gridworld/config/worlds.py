@@ -37,8 +37,7 @@ class EnvConfig:
     @property
     def compiles_quickly(self) -> bool:
         """Whether it may be compiled while settings are composed: soon, and without code of the user's."""
-        imports = ":" in getattr(self, "id", "")
-        return not imports and not isinstance(self, EnumeratedConfig | BuiltConfig)
+        return not isinstance(self, EnumeratedConfig | BuiltConfig)
 
     def compile(self) -> Mdp:
         """Compile the world."""
@@ -84,7 +83,10 @@ class MapConfig(EnvConfig):
 
 @dataclass
 class GymnasiumConfig(EnvConfig):
-    """An environment of Gymnasium that has a transition table; its step limit is that of its id."""
+    """An environment of Gymnasium, by its transition table if it has one, else enumerated.
+
+    Its step limit is that of its id.
+    """
 
     source: Word = "gymnasium"
     id: EnvId = MISSING  # that it is registered under, e.g. FrozenLake-v1
@@ -94,15 +96,33 @@ class GymnasiumConfig(EnvConfig):
     def name(self) -> str:
         return self.id
 
-    def compile(self) -> Mdp:
-        from gridworld.world.sources.gymnasium_table import compile_gymnasium
+    @property
+    def compiles_quickly(self) -> bool:
+        if ":" in self.id or not super().compiles_quickly:
+            return False
+        from gridworld.world.sources.gymnasium_table import has_table, make_env
 
-        return compile_gymnasium(self.id, self.kwargs)
+        return has_table(make_env(self.id, self.kwargs).unwrapped)
+
+    def compile(self) -> Mdp:
+        from gridworld.world.sources.enumerated import compile_id
+
+        return compile_id(self.id, self.kwargs)
+
+    def step_limit(self, mdp: Mdp) -> int:
+        limit, own = super().step_limit(mdp), mdp.max_episode_steps
+        if own is not None and limit > own and mdp.truth.startswith("enumerated"):
+            # the environment itself ends its episodes at its own limit
+            raise InputError(
+                f"env.max_episode_steps={limit}: {mdp.name} truncates its episodes after {own} steps; "
+                f"give at most {own}"
+            )
+        return limit
 
 
 @dataclass
 class EnumeratedConfig(GymnasiumConfig):
-    """A deterministic environment of Gymnasium whose states are found by trying all actions."""
+    """An environment of Gymnasium whose states are found by trying all actions and random draws."""
 
     source: Word = "enumerated"
     # attributes that are not part of its state, by your word
@@ -112,16 +132,6 @@ class EnumeratedConfig(GymnasiumConfig):
         from gridworld.world.sources.enumerated import enumerate_env
 
         return enumerate_env(self.id, self.kwargs, ignore=self.ignore)
-
-    def step_limit(self, mdp: Mdp) -> int:
-        # the environment itself ends its episodes at its own limit
-        limit, own = super().step_limit(mdp), mdp.max_episode_steps
-        if own is not None and limit > own:
-            raise InputError(
-                f"env.max_episode_steps={limit}: {mdp.name} truncates its episodes after {own} steps; "
-                f"give at most {own}"
-            )
-        return limit
 
 
 @dataclass

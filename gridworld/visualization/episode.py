@@ -109,6 +109,10 @@ class RealEnv:
         self._id, self._mdp = env.id, mdp
         self._env = make_env(env.id, dict(env.kwargs), render_mode="rgb_array")
         self.has_table = has_table(self._env.unwrapped)
+        if not self.has_table and (mdp.is_stochastic or len(mdp.start_states) > 1):
+            raise InputError(
+                f"env.id={env.id}: its steps are random, so it cannot be led through the states of an episode"
+            )
 
     def reset(self, state: int) -> None:
         """Start an episode in a start state."""

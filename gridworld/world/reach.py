@@ -50,7 +50,12 @@ _BY_NAME = {"getattr", "hasattr", "setattr", "delattr", "__dict__"}  # who may c
 # What leaves a step to chance, as messages of `UnreadableError` begin; and modules that have it.
 _CHANCE = ("time.", "posix.urandom", "numpy.random.", "a SystemRandom", "datetime.")
 _OF_CHANCE = {"time", "os", "secrets", "uuid", "datetime", "numpy"}
-_NO_CHANCE = ("time.sleep", "numpy.random.RandomState.", "numpy.random._generator.Generator.")
+_NO_CHANCE = (
+    "time.sleep",
+    "numpy.random.seed",
+    "numpy.random.RandomState.",
+    "numpy.random._generator.Generator.",
+)
 _MAKING = {"__init__", "__new__", "__post_init__", "__init_subclass__", "__set_name__", "__del__"}
 _CODE = (FunctionType, staticmethod, classmethod, property)
 _OF_ITS_OWN = {"_observation_space", "_action_space"}  # what Gymnasium's properties show of a wrapper

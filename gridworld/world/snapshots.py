@@ -7,11 +7,13 @@ code are kept as they are: they are read once, and must stay what they were.
 
 from __future__ import annotations
 
+import hashlib
+import inspect
 import io
 import pickle
 import random
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import Any
 
@@ -23,19 +25,76 @@ from gridworld.world.reading import GENERATORS, UnreadableError, digest, generat
 _KEPT = (gym.Space, gym.envs.registration.EnvSpec, FunctionType, BuiltinFunctionType, ModuleType, *GENERATORS)
 
 
+def _blackjack(env: Any) -> Any:
+    """All that its code reads of the player's hand: the sum, an ace, and where it matters a natural."""
+    hand = env.player
+    is_natural = (env.sab or env.natural) and sorted(hand) == [1, 10]
+    return env.dealer, sum(hand), 1 in hand, is_natural, env.sab, env.natural
+
+
+# Of classes whose attributes hold more than their steps depend on: what these do depend on, the sha256 of
+# the source from which that was read, without what only draws pictures, and the attributes that are known.
+_READ: dict[str, tuple[Callable[[Any], Any], str, str]] = {
+    "gymnasium.envs.toy_text.blackjack:BlackjackEnv": (
+        _blackjack,
+        "c25a321d0d3112d10a043c8a978a690470e25c00842cda7670e19164148cb687",
+        "action_space observation_space natural sab render_mode spec _np_random _np_random_seed dealer "
+        "player dealer_top_card_suit dealer_top_card_value_str",
+    )
+}
+
+
+def _what_is_read(env: Any) -> Callable[[Any], Any] | None:
+    kind = type(env)
+    if (known := _READ.get(f"{kind.__module__}:{kind.__qualname__}")) is None:
+        return None
+    read, source, names = known
+    return read if source_digest(kind) == source and vars(env).keys() <= set(names.split()) else None
+
+
+def source_digest(kind: type) -> str:
+    """The sha256 of the source of a class and its module's functions, but for what makes pictures."""
+    module = sys.modules[kind.__module__]
+    members = [*vars(module).items(), *vars(kind).items()]
+    functions = {
+        name: each
+        for name, each in members
+        if isinstance(each, FunctionType)
+        and not name.startswith(("draw_table", "render", "close", "__init__"))
+    }
+    try:
+        text = "".join(inspect.getsource(functions[name]) for name in sorted(functions))
+    except (OSError, TypeError):  # there is none
+        return ""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
 class Snapshots:
     """Takes copies of the state of an unwrapped environment, always the same one; puts them back."""
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, env: gym.Env[Any, Any], generator: Any = None) -> None:
         self._env = env
+        self._generator = generator
+        self._read_by = _what_is_read(env)
+        self._replaced: dict[int, Any] = {} if generator is None else {id(generator): generator}  # by id
         self._kept: dict[int, Any] = {}  # by id
         self._read: dict[int, tuple[Any, bytes]] = {}  # what was kept, and a digest of it
         self._generators: dict[int, Any] = {}  # in what was kept
 
+    def replace(self, old: Any, new: Any) -> None:
+        """Put another object in place of one, wherever the attributes hold it, now and in later copies."""
+        self._replaced[id(old)] = new
+        self._kept[id(new)], self._kept[id(old)] = new, old  # held, so that the id is not given again
+        self.put_back(self.take())
+
+    def _known(self) -> list[Any]:
+        """What is not read: the environment, and its generator, under whatever names it has it."""
+        return [self._env, self._generator or vars(self._env).get("_np_random")]
+
     def take(self) -> bytes:
         """A copy of the state. Equal copies are of equal states; equal states may have several."""
         buffer = io.BytesIO()
-        _Pickler(buffer, self._env, self._kept).dump(vars(self._env))
+        _Pickler(buffer, self._env, self._kept, self._replaced).dump(vars(self._env))
         return buffer.getvalue()
 
     def put_back(self, snapshot: bytes) -> None:
@@ -46,6 +105,8 @@ class Snapshots:
 
     def key(self, without: Collection[str] = ()) -> bytes:
         """A digest of the state, but for some attributes; UnreadableError where it cannot be compared."""
+        if self._read_by is not None:
+            return self._digest(self._read_by(self._env))
         attributes = self._attributes(without)
         try:
             return self._digest([part for item in attributes for part in item])
@@ -69,16 +130,16 @@ class Snapshots:
     def changed(self) -> Any:
         """Something of what is kept as it is that changed all the same; None if nothing did."""
         for value, before in self._read.values():
-            if digest(value, [self._env], self._generators) != before:
+            if digest(value, self._known(), self._generators) != before:
                 return value
         return None
 
     def _digest(self, value: Any) -> bytes:
-        return digest(value, [self._env], self._generators, self._kept_value)
+        return digest(value, self._known(), self._generators, self._kept_value)
 
     def _kept_value(self, value: Any) -> tuple[Any, Sequence[Any]]:
         if id(value) not in self._read:
-            self._read[id(value)] = value, digest(value, [self._env], self._generators)
+            self._read[id(value)] = value, digest(value, self._known(), self._generators)
         return "kept", self._read[id(value)][1:]
 
     def _attributes(self, without: Collection[str]) -> list[tuple[str, Any]]:
@@ -92,11 +153,13 @@ def _kept(number: int) -> Any:
 
 
 class _Pickler(pickle.Pickler):
-    def __init__(self, file: io.BytesIO, env: Any, kept: dict[int, Any]) -> None:
+    def __init__(self, file: io.BytesIO, env: Any, kept: dict[int, Any], replaced: dict[int, Any]) -> None:
         super().__init__(file, protocol=5)
-        self._env, self._kept_by_id = env, kept
+        self._env, self._kept_by_id, self._replaced = env, kept, replaced
 
     def reducer_override(self, obj: Any) -> Any:  # three times as fast as `persistent_id`
+        if id(obj) in self._replaced:
+            return _kept, (id(self._replaced[id(obj)]),)
         local = isinstance(obj, type) and "<locals>" in obj.__qualname__
         if obj is not _kept and (obj is self._env or local or isinstance(obj, _KEPT)):
             self._kept_by_id[id(obj)] = obj

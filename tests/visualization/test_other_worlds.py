@@ -344,9 +344,10 @@ def test_large_frames_are_made_smaller():
     ("env_id", "words"),
     [
         ("NoSuchWorld-v0", "is not registered with Gymnasium .*doesn't exist"),
-        *((name, r"cannot be rendered: [^\n]*$") for name in ("Pendulum-v1", "CartPole-v1", "Blackjack-v1")),
+        ("Pendulum-v1", r"cannot be rendered: [^\n]*$"),
+        ("Blackjack-v1", "its steps are random, so it cannot be led"),
     ],
 )
 def test_what_cannot_be_rendered_is_one_sentence(env_id, words):
     with pytest.raises(InputError, match=f"^env.id={env_id}: {words}"):
-        frames_of(env_id, [0, 4, 8], FROZEN_LAKE)
+        frames_of(env_id, [36, 24, 25], FROZEN_LAKE if env_id == "Blackjack-v1" else CLIFF_WALKING)

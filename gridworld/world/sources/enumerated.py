@@ -1,9 +1,11 @@
-"""Worlds from deterministic Gymnasium environments, enumerated: every action in a copy of every state.
+"""Worlds from Gymnasium environments without a table, enumerated: every action in a copy of every state.
 
     search    the states and what each action does there; everything that changes is state, the time included
+    draws     a generator in place of the environment's own takes every outcome in turn (`world.branching`)
+    beliefs   what observations leave open of the state (`sources.beliefs`): the states of the world
     replay    the environment itself beside the table, thousands of steps: any difference is refused
 
-A state is read exactly or refused (`reading`). The search refuses generators that a step draws from, wherever
+A state is read exactly or refused (`reading`). The search refuses draws from other generators, wherever
 the state holds them, spaces and functions that change, and changes outside the attributes. The replay is for
 what that may miss, such as attributes that the user told it to leave out, or a wrapper. With attributes that
 a user names as no part of a state, the claim rests on that, and `truth` says so.
@@ -11,34 +13,41 @@ a user names as no part of a state, the claim rests on that, and `truth` says so
 The step limit is that of the id or the one at which the environment truncates by itself. A state at the limit
 is not terminal, since the environment does not say so, but every action stays there and pays nothing.
 
-Its own observation is a table where the observation space is a Box or Discrete, or a Dict with a Box
-`image`, of which this entry is taken, as minigrid's `ImgObsWrapper` does. An end is a success if it pays more
-than 0, and if none does, if it pays best.
+Its own observation is a table where the observation space is a Box, of whole numbers (Discrete,
+MultiDiscrete, MultiBinary, a Tuple of Discrete), or a Dict with a Box `image`, of which this entry is taken,
+as minigrid's `ImgObsWrapper` does. An end is a success if it pays more than 0, and if none does, if it pays
+best.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import contextlib
+import itertools
+import pickle
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import EnumType
-from typing import Any, NamedTuple
+from fractions import Fraction
+from functools import partial
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order
 
 from gridworld.base.console import telling_if_slow
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import check_memory
-from gridworld.world.mdp import BoolArray, Mdp
-from gridworld.world.outcomes import MOST_ACTIONS, MOST_STATES, Outcomes, mdp_from_outcomes
+from gridworld.world.branching import Branching
+from gridworld.world.mdp import Mdp
+from gridworld.world.outcomes import MOST_ACTIONS, MOST_STATES, mdp_from_outcomes
 from gridworld.world.reach import Reach
 from gridworld.world.reading import UnreadableError, digest
 from gridworld.world.snapshots import Snapshots, random_states
-from gridworld.world.sources.gymnasium_table import make_env
+from gridworld.world.sources.beliefs import Beliefs, Node, Step, lumped
+from gridworld.world.sources.gymnasium_table import compile_gymnasium, has_table, make_env
+from gridworld.world.sources.replay import Replay
 from gridworld.world.wrappers import refuse_transformed
 
 _BEYOND = 1_000  # states further than a step limit that are found too, so that a small world is whole
@@ -46,12 +55,11 @@ _DEEPEST = 10_000  # steps from the start
 _MOST_BYTES = 2**31  # of all copies and observations together
 _SAMPLED = 16  # of so many states the copy of one is kept, to name what keeps changing
 _FACING = ("right", "down", "left", "up")  # minigrid's directions
-_RESETS = 8  # that must lead to the same state
-_STEPS, _EPISODES = 3_000, 5  # of the replay, at least
-_LONGEST = 10_000  # steps of its first episode where the time may be left out; who cuts later has no limit
-_LONG = 500  # of the others
-_AT_RANDOM = 10  # steps between two directed walks
-_SEED = 20_260_101
+_METHODS = ("step", "reset")  # what is read of them
+_ELSEWHERE = "draws a random number from another generator than self.np_random, so its outcomes are unknown"
+_OVER = -1  # in place of the state in which an episode ends, where there is chance
+_MOST_RUNS = 10_000_000  # of a step or a reset, some minutes
+_LONGEST_NAME = 60  # of a state that is called by its observation
 
 
 def enumerate_env(
@@ -61,7 +69,7 @@ def enumerate_env(
     ignore: Sequence[str] = (),
     most_states: int = MOST_STATES,
 ) -> Mdp:
-    """Compile a deterministic environment by trying every action in a copy of every state.
+    """Compile an environment by trying every action in a copy of every state, with every draw of `np_random`.
 
     Args:
         env_id: its registered id.
@@ -70,17 +78,18 @@ def enumerate_env(
         most_states: more are refused as soon as they are found.
 
     Returns:
-        The world; its `truth` is "enumerated, N states", and without which attributes.
+        The world; its `truth` is "enumerated, N states", of what, and without which attributes. Its states
+        are what a history of observations and rewards leaves open of the environment's own, see `beliefs`.
     """
     with telling_if_slow(f"enumerating {env_id}"):
         env = make_env(env_id, kwargs)
         try:
-            search = _Search(env_id, env, ignore, most_states)
+            search = Search(env_id, env, ignore, most_states)
             limit = None if env.spec is None else env.spec.max_episode_steps
             limit = limit if limit is not None and limit > 0 else None  # -1 is "none" to `gymnasium.make`
             search.explore(limit)
             mdp = search.compiled(limit)
-            found_limit = _Replay(search, mdp, make_env(env_id, kwargs)).check()
+            found_limit = Replay(search, mdp, make_env(env_id, kwargs)).check()
             refuse_transformed(f"env.id={env_id}", env)
         except UnreadableError as error:
             raise InputError(
@@ -92,93 +101,80 @@ def enumerate_env(
     return replace(mdp, max_episode_steps=found_limit)
 
 
-class _Step(NamedTuple):
-    """What an action does: the number of the state that follows, and what the environment returns."""
-
-    following: int
-    reward: float
-    terminated: bool
-    truncated: bool
+Named = tuple[str, tuple[str, int, int] | None]  # what a reader calls a state, and its place
 
 
 @dataclass
-class _State:
+class State:
+    """A state of the environment itself, which an agent may not see."""
+
     number: int
     key: bytes
-    seen: bytes  # a digest of its observation
+    seen: bytes  # a digest of the observation with which it was found
     depth: int  # steps from the start
     copy: bytes  # b"" where it is no longer needed
     name: str
     place: tuple[str, int, int] | None  # which way the agent faces, row and column
-    observation: NDArray[Any] | None
     is_open: bool = False  # an episode goes on in it
-    steps: Sequence[_Step] = ()  # of each action; empty where none was tried
+    steps: Sequence[Sequence[Step]] = ()  # the outcomes of each action; empty where none was tried
 
 
-class _Search:
-    """Finds the states of an environment, the start first, breadth first.
+class Search:
+    """Finds the states of an environment, those after a reset first, breadth first.
 
     It is one object, into which copies of its states are put; `ignore` are attributes that are no state.
     """
 
     def __init__(self, name: str, env: gym.Env[Any, Any], ignore: Sequence[str], most_states: int) -> None:
         self.name, self.ignore, self._most_states = name, tuple(ignore), most_states
-        self.states: list[_State] = []
+        self.states: list[State] = []
+        self.observations: dict[bytes, NDArray[Any] | None] = {}  # by their digests
+        self._shown: dict[bytes, str] = {}  # the same as short texts
+        self._ends: dict[bytes, Named] = {}  # what ends are called, by their observations
+        self.is_random = False
         self._env = env.unwrapped
-        self._snapshots = Snapshots(self._env)
+        self._branching = Branching(f"env.id={name}")
+        self._snapshots = Snapshots(self._env, self._branching)
         actions = env.action_space
         if not isinstance(actions, spaces.Discrete) or actions.start != 0 or actions.n > MOST_ACTIONS:
             raise self.refusal(
                 f"its actions are {actions}, must be Discrete(n), from 0 to {MOST_ACTIONS} - 1"
             )
         self._num_actions = int(actions.n)
-        self._by_key: dict[bytes, _State] = {}
-        self._by_copy: dict[bytes, _State] = {}  # by a digest of a copy, of which a state may have several
-        self._num_bytes = 0
-        self._check_start()
+        self._by_key: dict[bytes, State] = {}
+        self._by_copy: dict[bytes, State] = {}  # by a digest of a copy, of which a state may have several
+        self._num_bytes = self._num_runs = 0
 
     def refusal(self, reason: str) -> InputError:
         """An error that says why there is no table of it."""
         return InputError(f"env.id={self.name}: {reason}")
 
-    def _check_start(self) -> None:
+    def _prepare(self) -> None:
+        """Put the generator that branches in place of the environment's own, wherever it holds that."""
         self._env.reset(seed=0)
-        assert self._env.np_random is not None  # it is made when it is first asked for
+        own = self._env.np_random  # it is made when it is first asked for
         if unknown := [each for each in self.ignore if each not in vars(self._env)]:
             raise InputError(
                 f"env.ignore={list(self.ignore)}: {self.name} has no attribute {unknown[0]}; it has "
                 f"{', '.join(vars(self._env))}"
             )
-        key, before = self._snapshots.key(self.ignore), self._snapshots.keys(self.ignore)
-        for seed in range(_RESETS):
-            self._env.reset(seed=seed)
-            if self._snapshots.key(self.ignore) != key:
-                now = self._snapshots.keys(self.ignore)
-                changed = _listed(name for name, each in now.items() if each != before.get(name))
-                remedy = self._remedy or (
-                    "; use an environment with a fixed layout and start, or list irrelevant attributes in "
-                    "env.ignore"
-                )
-                raise self.refusal(
-                    f"a reset does not always lead to the same state (in {changed}), so its states cannot "
-                    f"be enumerated from one start{remedy}"
-                )
-
-    @property
-    def _remedy(self) -> str:
-        return "; it has a transition table, so use env=gymnasium" if hasattr(self._env, "P") else ""
+        self._snapshots.replace(own, self._branching)
 
     def explore(self, limit: int | None) -> None:
         """Find all states that can be reached, and what every action does there.
 
         Episodes are over at the step limit. What lies beyond it is kept too if it is little.
         """
-        observation, _ = self._env.reset(seed=0)
-        outside = Reach(f"env.id={self.name}", self._env, "step", skips=True)
-        before = outside.content(is_outside=True)
-        start = self._state_after(observation, 0)
-        start.is_open = True
-        waiting, size = [start], 0
+        self._prepare()
+        where = f"env.id={self.name}"
+        outside = [Reach(where, self._env, method, [self._branching], skips=True) for method in _METHODS]
+        before = [each.content(is_outside=True) for each in outside]
+        self.starts = self._resets(self._snapshots.take())
+        waiting, size = [self.states[each.following] for each in self.starts], 0
+        waiting = list({each.number: each for each in waiting}.values())
+        for state in waiting:
+            state.is_open = True
+        self._check_resets(waiting[0])
         beyond: int | None = None  # where in `waiting` the limit is, with `size` states before it
         for place, state in enumerate(waiting):  # which grows
             if beyond is None and state.depth >= (limit or _DEEPEST):
@@ -196,61 +192,128 @@ class _Search:
                     late.steps = ()
                 del self.states[size:]
                 break
-            for step in state.steps:
-                following = self.states[step.following]
+            for step in itertools.chain.from_iterable(state.steps):
+                following = self.states[step.following]  # of an end, any
                 if not (step.terminated or step.truncated or following.is_open):
                     following.is_open = True
                     waiting.append(following)
         kept = self._snapshots.changed()
-        if kept is not None or outside.content(is_outside=True) != before:
+        if kept is not None or [each.content(is_outside=True) for each in outside] != before:
             raise self.refusal(
                 f"a step changes {type(kept).__name__ if kept else 'what is outside of its attributes'}, of "
                 "which no copies can be made; hold what changes in attributes: numbers, lists, numpy arrays"
             )
+        self._check_resets(next(each for each in reversed(self.states) if each.copy))
 
-    def _tried(self, state: _State) -> list[_Step]:
-        """What each action does in a copy of a state."""
-        steps, before = [], (self._snapshots.random_states(), random_states())
-        for action in range(self._num_actions):
-            self._snapshots.put_back(state.copy)
+    def _resets(self, copy: bytes) -> list[Step]:
+        """What a reset leads to from a copy of a state."""
+        before = self._random_states()
+
+        def reset() -> tuple[int, bytes, float, bool, bool]:
+            self._snapshots.put_back(copy)
             try:
-                observation, reward, terminated, truncated, _ = self._env.step(action)
+                observation, _ = self._env.reset()
             except Exception as error:  # whatever it raises
-                raise self.refusal(f"a step with action {action} fails: {error}") from error
-            following = self._state_after(observation, state.depth + 1)
-            steps.append(_Step(following.number, float(reward), bool(terminated), bool(truncated)))
-        if (self._snapshots.random_states(), random_states()) != before:
-            raise self.refusal(f"a step draws a random number, so it is not deterministic{self._remedy}")
+                raise self.refusal(f"a reset fails: {error}") from error
+            if vars(self._env).get("_np_random") is not self._branching:
+                raise self.refusal("reset() makes another np_random; leave that to super().reset(seed=seed)")
+            return *self._state_after(observation, 0), 0.0, False, False
+
+        found = self._merged(reset)
+        if self._random_states() != before:
+            raise self.refusal(f"a reset {_ELSEWHERE}")
+        return found
+
+    def _check_resets(self, state: State) -> None:
+        """A reset must lead to the same from every state."""
+        size = len(self.states)
+        found = self._resets(state.copy)
+        if len(self.states) == size and sorted(found) == sorted(self.starts):
+            return
+        values: list[dict[str, bytes]] = []
+        for each in (self.states[self.starts[0].following], self.states[found[0].following]):
+            self._snapshots.put_back(each.copy)
+            values.append(self._snapshots.keys(self.ignore))
+        changed = _listed(name for name, each in values[1].items() if each != values[0].get(name))
+        raise self.refusal(
+            f"a reset does not always lead to the same state (in {changed}), so its states cannot be "
+            "enumerated from one start; set all of it in reset(), or list irrelevant attributes in env.ignore"
+        )
+
+    def _random_states(self) -> Any:
+        return self._snapshots.random_states(), random_states()
+
+    def _tried(self, state: State) -> list[list[Step]]:
+        """What each action does in a copy of a state."""
+        before = self._random_states()
+        steps = [self._merged(partial(self._stepped, state, action)) for action in range(self._num_actions)]
+        if self._random_states() != before:
+            raise self.refusal(f"a step {_ELSEWHERE}")
         if state.number % _SAMPLED:
             self._num_bytes -= len(state.copy)
             state.copy = b""
         return steps
 
-    def _state_after(self, observation: Any, depth: int) -> _State:
-        """The state that the environment is in."""
+    def _stepped(self, state: State, action: int) -> tuple[int, bytes, float, bool, bool]:
+        self._snapshots.put_back(state.copy)
+        try:
+            observation, reward, terminated, truncated, _ = self._env.step(action)
+            shown = float(reward), bool(terminated), bool(truncated)
+        except Exception as error:  # whatever it raises
+            raise self.refusal(f"a step with action {action} fails: {error}") from error
+        return *self._state_after(observation, state.depth + 1, is_over=shown[1]), *shown
+
+    def _merged(self, run: Callable[[], tuple[int, bytes, float, bool, bool]]) -> list[Step]:
+        """Its different results, each with its probability."""
+        sums: dict[tuple[int, bytes, float, bool, bool], Fraction] = {}
+        for probability, result in self._branching.outcomes(run):
+            sums[result] = sums.get(result, Fraction(0)) + probability
+            self._num_runs += 1
+            self.is_random |= self._branching.has_drawn
+        if self._num_runs > _MOST_RUNS:
+            raise self.refusal(f"its random outcomes are more than {_MOST_RUNS:,}, too many to try them all")
+        return [Step(probability, *result) for result, probability in sums.items()]
+
+    def _state_after(self, observation: Any, depth: int, is_over: bool = False) -> tuple[int, bytes]:
+        """The number of the state that the environment is in, and a digest of the observation."""
+        try:
+            seen = digest(observation)
+        except UnreadableError:
+            with contextlib.suppress(Exception):
+                pickle.dumps(observation)  # a random number in it is refused with its line
+            raise
+        if seen not in self.observations:
+            self.observations[seen] = array = self._as_array(observation)
+            shown = " ".join(str(observation).split())
+            self._shown[seen] = f"observation {shown}" if len(shown) <= _LONGEST_NAME else ""
+            self._num_bytes += 0 if array is None else array.nbytes
+        if is_over and seen not in self._ends:
+            self._ends[seen] = self._named()
+        if is_over and self._branching.has_drawn:
+            return _OVER, seen
         try:
             copy = self._snapshots.take()
         except Exception as error:  # whatever the classes in it raise
             raise self.refusal(f"its state cannot be copied: {error}") from error
-        short, seen = digest(copy), digest(observation)
+        short = digest(copy)
         if (state := self._by_copy.get(short)) is None:
             key = self._snapshots.key(self.ignore)
-            state = self._by_key.get(key) or self._added(key, seen, depth, copy, observation)
+            state = self._by_key.get(key) or self._added(key, seen, depth, copy)
             self._by_copy[short] = state
-        if state.seen != seen:
+        if state.seen != seen and not self._branching.has_drawn:
             left_out = ", ".join(self.ignore)
             without = f" without {left_out}, which env.ignore leaves out" if left_out else ""
             raise self.refusal(
                 f"the same state has different observations, so they are not a function of the state{without}"
             )
-        return state
+        return state.number, seen
 
-    def _added(self, key: bytes, seen: bytes, depth: int, copy: bytes, observation: Any) -> _State:
-        array, size = self._as_array(observation), 1 + len(self.states)
-        state = _State(size - 1, key, seen, depth, copy, *self._named(), array)
+    def _added(self, key: bytes, seen: bytes, depth: int, copy: bytes) -> State:
+        size, (name, place) = 1 + len(self.states), self._named()
+        state = State(size - 1, key, seen, depth, copy, name, place)
         self._by_key[key] = state
         self.states.append(state)
-        self._num_bytes += len(copy) + (0 if array is None else array.nbytes)
+        self._num_bytes += len(copy)
         if size > self._most_states:
             raise self.refusal(
                 f"more than {self._most_states:,} states can be reached, too many to solve, since its "
@@ -263,7 +326,7 @@ class _Search:
         check_memory(f"env.id={self.name}", self._num_bytes)
         return state
 
-    def _named(self) -> tuple[str, tuple[str, int, int] | None]:
+    def _named(self) -> Named:
         """What a reader calls its state, and its place, by attributes that minigrid's environments have."""
         place, direction = (getattr(self._env, name, None) for name in ("agent_pos", "agent_dir"))
         try:
@@ -281,11 +344,16 @@ class _Search:
         space = self._env.observation_space
         image = space.spaces.get("image") if isinstance(space, spaces.Dict) else None
         part = image if isinstance(image, spaces.Box) else space
-        if not isinstance(part, spaces.Box | spaces.Discrete):
+        if isinstance(part, spaces.Tuple) and all(isinstance(each, spaces.Discrete) for each in part):
+            kind: Any = np.int64
+            shape: Any = (len(part.spaces),)
+        elif isinstance(part, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+            kind, shape = part.dtype, part.shape
+        else:
             return None
         try:
-            array = np.array(observation, part.dtype) if part is space else np.array(observation["image"])
-            fits = array.shape == part.shape and array.dtype.kind in "biuf"
+            array = np.array(observation, kind) if part is space else np.array(observation["image"])
+            fits = array.shape == shape and array.dtype.kind in "biuf"
             if isinstance(part, spaces.Discrete):
                 fits = fits and bool(part.start <= array < part.start + part.n)
         except (TypeError, ValueError, KeyError, IndexError, OverflowError):
@@ -313,48 +381,84 @@ class _Search:
 
     def compiled(self, limit: int | None) -> Mdp:
         """The world of what was found; a state in which nothing was tried stays as it is."""
-        stay = [[_Step(each.number, 0.0, False, False)] * self._num_actions for each in self.states]
-        rows = [each.steps or still for each, still in zip(self.states, stay, strict=True)]
-        columns = np.array(rows, dtype=np.float64)  # (N, A, 4)
-        reward, terminated, truncated = columns[:, :, 1], columns[:, :, 2] > 0, columns[:, :, 3] > 0
-        limits = [each for each in (self._own_limit(terminated, truncated), limit) if each is not None]
-        paid = terminated & (reward > 0)
-        observations = [each.observation for each in self.states if each.observation is not None]
-        found = [each.place for each in self.states if each.place is not None]
+        steps = [each.steps for each in self.states]
+        classes = list(range(len(steps)))
+        if self.is_random:  # where an episode is over, nothing but the observation matters
+            steps = [
+                [
+                    [each._replace(following=_OVER) if each.terminated else each for each in row]
+                    for row in rows
+                ]
+                for rows in steps
+            ]
+            classes = lumped(steps)
+        members: dict[int, list[State]] = {}
+        for state, number in zip(self.states, classes, strict=True):
+            members.setdefault(number, []).append(state)
+        self.members = [*(members[number] for number in range(len(members))), []]
+        classes.append(len(members))  # what is over, as the last
+        first = [
+            [
+                [each._replace(following=classes[each.following]) for each in row]
+                for row in steps[found[0].number]
+            ]
+            for found in self.members[:-1]
+        ]
+        starts = [(each.probability, classes[each.following], each.seen) for each in self.starts]
+        self.beliefs = beliefs = Beliefs(starts, [*first, []], self.refusal, MOST_STATES)
+        limits = [each for each in (self._own_limit(), limit) if each is not None]
+        observations = [self.observations[each.seen] for each in beliefs.nodes]
+        shown = [each for each in observations if each is not None]
+        check_memory(f"env.id={self.name}: its own observations", sum(each.nbytes for each in shown))
+        named = [self._name(each) for each in beliefs.nodes]
+        found = [place for _, place in named if place is not None]
         panels, places = list(dict.fromkeys(facing for facing, _, _ in found)), None
-        if len(found) == len(self.states):
+        if len(found) == len(named):
             places = np.array([(panels.index(facing), row, column) for facing, row, column in found])
             places[:, 1:] -= places[:, 1:].min(axis=0)  # without the walls around the room
-        check_memory(f"env.id={self.name}: its own observations", sum(each.nbytes for each in observations))
         mdp = mdp_from_outcomes(
             self.name,
-            Outcomes(
-                next_state=columns[:, :, 0].astype(np.int64)[:, :, None],
-                probability=np.ones((*reward.shape, 1)),
-                reward=reward[:, :, None],
-                terminated=terminated[:, :, None],
-                start=np.eye(1, len(rows))[0],
-                success=paid[:, :, None] if paid.any() else None,
-            ),
+            beliefs.outcomes(self.name, self._num_actions),
             action_names=self._action_names(),
             places=places,
             panel_names=panels,
             max_episode_steps=min(limits, default=None),
-            own_observation=np.stack(observations) if observations else None,
+            own_observation=np.stack(shown) if len(shown) == len(named) else None,
         )
-        names = tuple(each.name for each in self.states)
-        without = f" without {', '.join(self.ignore)}, as you asked" if self.ignore else ""
-        truth = f"enumerated, {mdp.num_states:,} states{without}"
-        return replace(mdp, state_names=names if names[0] else (), truth=truth)
+        names = tuple(name for name, _ in named)
+        return replace(mdp, state_names=names if all(names) else (), truth=self._truth())
 
-    def _own_limit(self, terminated: BoolArray, truncated: BoolArray) -> int | None:
+    def possible(self, node: Node) -> list[State]:
+        """The environment's own states that a belief does not rule out; none where the episode is over."""
+        return [state for number, _ in node.belief for state in self.members[number]]
+
+    def _name(self, node: Node) -> Named:
+        """What a reader calls a node: as its states, or where there is chance by what is shown there."""
+        found = {(each.name, each.place) for each in self.possible(node)} or {self._ends[node.seen]}
+        name, place = found.pop() if len(found) == 1 else ("", None)
+        return name or (self._shown[node.seen] if self.is_random else ""), place
+
+    def _truth(self) -> str:
+        without = f" without {', '.join(self.ignore)}, as you asked" if self.ignore else ""
+        size, nodes = len(self.members) - 1, self.beliefs.nodes
+        if all(len(each.belief) == 1 for each in nodes):
+            found = f"enumerated, {len(nodes):,} states{without}"
+        else:
+            found = f"enumerated, {len(nodes):,} beliefs about {size:,} hidden states{without}"
+        aliased = self.beliefs.num_aliased() if self.is_random else 0
+        return f"{found}; {aliased:,} observations stand for several of them" if aliased else found
+
+    def _own_limit(self) -> int | None:
         """The time at which the environment itself truncates all episodes, if any."""
-        time = np.array([[each.depth + 1] * self._num_actions for each in self.states])
-        tried = np.array([[bool(each.steps)] for each in self.states])
-        if not (truncated & ~terminated).any():
+        steps = ((each.depth + 1, step) for each in self.states for row in each.steps for step in row)
+        truncated: dict[bool, set[int]] = {True: set(), False: set()}  # times of steps that are no end
+        for time, step in steps:
+            if not step.terminated:
+                truncated[step.truncated].add(time)
+        if not truncated[True]:
             return None
-        limit = int(time[truncated & ~terminated].min())
-        if ((truncated != (time >= limit)) & tried & ~terminated).any():
+        limit = min(truncated[True])
+        if max(truncated[False], default=0) >= limit:
             raise self.refusal(
                 "it truncates some episodes earlier than others, so it has no single step limit"
             )
@@ -374,80 +478,8 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(sorted(names)) or "nothing"
 
 
-class _Replay:
-    """Walks through an environment that must be those of its table."""
-
-    def __init__(self, search: _Search, mdp: Mdp, env: gym.Env[Any, Any]) -> None:
-        self._search, self._mdp, self._limit = search, mdp, mdp.max_episode_steps
-        self._random = np.random.default_rng(_SEED)
-        self._env, self._snapshots = env, Snapshots(env.unwrapped)
-        self._steps = 0  # of this episode
-        origins = np.repeat(np.arange(mdp.num_states), mdp.num_actions)
-        leads = np.ones(len(origins)), (origins, mdp.next_state.ravel())
-        self._moves = csr_array(leads, shape=(mdp.num_states, mdp.num_states))
-
-    def check(self) -> int | None:
-        """Walk the new environment, with the wrappers of its id, to states drawn at random, and close it.
-
-        Returns the step limit: the table's, or what the walks found.
-        """
-        steps = episodes = 0
-        try:
-            while steps < _STEPS or episodes < _EPISODES:
-                most = _LONGEST if self._search.ignore and not episodes else _LONG
-                self._walk(most, episodes % 3 * _AT_RANDOM)
-                steps, episodes = steps + self._steps, episodes + 1
-        finally:
-            self._env.close()
-        return self._limit
-
-    def _walk(self, most: int, at_random: int) -> None:
-        """Walk to one state after the other, with random steps between, until the episode ends."""
-        mdp, state, actions = self._mdp, int(self._mdp.start_states[0]), list[int]()
-        observation, _ = self._env.reset(seed=int(self._random.integers(2**31)))
-        self._steps, truncated = 0, False
-        self._compare_state(observation, state)
-        while self._steps < most and not mdp.terminal[state] and not truncated:
-            if not actions:
-                actions = self._way_from(state)
-                actions += self._random.integers(mdp.num_actions, size=at_random).tolist()
-            action = actions.pop(0)
-            observation, reward, terminated, truncated, _ = self._env.step(action)
-            self._steps += 1
-            self._compare("reward", float(reward), float(mdp.reward[state, action, 0]))
-            state = int(mdp.next_state[state, action, 0])
-            truncated = bool(truncated and not terminated)
-            if truncated and self._limit is None and self._search.ignore:
-                self._limit = self._steps
-            is_end = bool(mdp.terminal[state])
-            is_cut = not is_end and self._limit is not None and self._steps >= self._limit
-            self._compare("end (terminated, truncated)", [bool(terminated), truncated], [is_end, is_cut])
-            self._compare_state(observation, state)
-
-    def _way_from(self, state: int) -> list[int]:
-        """The actions by which to come to a state drawn at random, first to one where it goes on."""
-        mdp = self._mdp
-        reached, before = breadth_first_order(self._moves, state)
-        going_on = reached[~mdp.absorbing[reached]]
-        target = int(self._random.choice(going_on if going_on.size > 1 else reached))
-        way: list[int] = []
-        while target != state:
-            origin = int(before[target])
-            way.append(int(np.argmax(mdp.next_state[origin, :, 0] == target)))
-            target = origin
-        return way[::-1] or [int(self._random.integers(mdp.num_actions))]
-
-    def _compare_state(self, observation: Any, state: int) -> None:
-        expected = self._search.states[self._mdp.number[state]]
-        found = self._snapshots.key(self._search.ignore), digest(observation)
-        self._compare("state", found, (expected.key, expected.seen))
-
-    def _compare(self, what: str, found: Any, expected: Any) -> None:
-        if found != expected:
-            shown = f" ({found}, enumerated as {expected})" if what != "state" else ""
-            left_out = ", ".join(self._search.ignore)
-            depends = f"depends on {left_out}, which env.ignore leaves out, " if left_out else ""
-            raise self._search.refusal(
-                f"after {self._steps} steps of an episode its {what} is not the enumerated one{shown}, so "
-                f"it {depends}is random, has state outside its attributes, or has a wrapper that changes it"
-            )
+def compile_id(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Mdp:
+    """Compile an environment by its transition table if it has one, else by enumeration."""
+    env = make_env(env_id, kwargs)
+    env.close()
+    return (compile_gymnasium if has_table(env.unwrapped) else enumerate_env)(env_id, kwargs)

@@ -87,7 +87,7 @@ def _compiled(real: gym.Env[Any, Any], name: str, limit: int | None) -> tuple[Md
     if is_fickle and getattr(real, "fickle_probability", 1) > 0:
         raise InputError(
             f"{name}: fickle_passenger=True changes the destination in a way that its table P lacks, so it "
-            "cannot be solved exactly; leave it out"
+            "cannot be solved exactly; leave it out, or use env=enumerated"
         )
     return mdp, table
 
@@ -96,8 +96,7 @@ def _table(name: str, real: Any) -> Outcomes:
     """P and the start distribution as arrays; an outcome that a row does not have has probability 0."""
     if not has_table(real):
         raise InputError(
-            f"{name}: has no transition table P; if it is deterministic, env=enumerated can find its states "
-            "by trying all actions"
+            f"{name}: has no transition table P; env=enumerated can find its states by trying all actions"
         )
     sizes = []
     for what in ("observation", "action"):

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
 SEED = 20_240_501  # of the walk
-_FALSE_ALARM = 1e-9  # probability that a true table is refused
+FALSE_ALARM = 1e-9  # probability that a true table is refused
 _JUDGED = 5  # kinds of counts
 _CONCENTRATIONS = np.array([1.0, 10.0, 100.0, 1000.0])  # of the Dirichlet priors around a row
 _VAGUE = 0.5  # what cannot be told nearer than that is not told
@@ -188,7 +188,7 @@ class _Walker:
         self._step_rows(self._rng.permutation(np.tile(rows, _ROWS // len(rows))))
         uncertain = rows[self._chance[rows].max(axis=1) < 1]
         for _ in range(_ROUNDS):
-            wrong = np.argsort(-_evidence(self._counts[uncertain], self._chance[uncertain]), kind="stable")
+            wrong = np.argsort(-evidence(self._counts[uncertain], self._chance[uncertain]), kind="stable")
             self._step_rows(np.repeat(uncertain[wrong[:_SUSPECTS]], _AGAIN))
 
     def _step_rows(self, rows: IntArray) -> None:
@@ -225,10 +225,10 @@ class _Walker:
 
     def _judge(self, names: list[str], counts: NDArray[Any], chance: FloatArray) -> None:
         """Refuse counts (n, K) that cannot come from these probabilities (n, K)."""
-        evidence = _evidence(counts, chance)
-        if evidence.max(initial=0) <= np.log(_JUDGED * max(1, len(evidence)) / _FALSE_ALARM):
+        found = evidence(counts, chance)
+        if found.max(initial=0) <= np.log(_JUDGED * max(1, len(found)) / FALSE_ALARM):
             return
-        row = int(evidence.argmax())
+        row = int(found.argmax())
         size = int(counts[row].sum())
         which = int(np.abs(counts[row] - size * chance[row]).argmax())
         raise InputError(
@@ -295,7 +295,7 @@ def _merged(table: Outcomes) -> tuple[IntArray, FloatArray]:
     return column, np.asarray(chance.reshape(-1, count))
 
 
-def _evidence(counts: NDArray[Any], chance: FloatArray) -> FloatArray:
+def evidence(counts: NDArray[Any], chance: FloatArray) -> FloatArray:
     """(R,), log Bayes factors of Dirichlet mixtures around the chances (R, K), against the chances."""
     if not len(counts):
         return np.zeros(0)

@@ -204,7 +204,7 @@ def test_a_step_count_that_is_left_out(variant: str, limit: int | None) -> None:
 
 @pytest.mark.parametrize(
     ("variant", "limit", "what"),
-    [("once", 60, "reward"), ("decay", 20, "reward"), ("gate", 20, "reward"), ("toll", 25, "reward")],
+    [("once", 60, "reward"), ("decay", 20, "reward"), ("gate", 20, "(state|reward)"), ("toll", 25, "reward")],
 )
 def test_what_is_left_out_must_not_matter(variant: str, limit: int, what: str) -> None:
     with pytest.raises(
@@ -238,9 +238,7 @@ def test_states_beyond_the_step_limit_that_have_an_end_are_found() -> None:
 @pytest.mark.parametrize(
     ("env_id", "kwargs", "reason"),
     [
-        ("Corridor-v0", {"variant": "random"}, "draws a random number"),
         ("Corridor-v0", {"variant": "global"}, "draws a random number"),
-        ("Corridor-v0", {"variant": "layout"}, "a reset does not always lead to the same state"),
         ("ShortCorridor-v0", {"variant": "hidden"}, "a step changes what is outside of its attributes"),
         ("Corridor-v0", {"variant": "endless"}, "more than 300 states .* since its past keeps changing"),
         ("Corridor-v0", {}, r"since its steps keeps changing; .* e.g. env.ignore=\[steps\]"),
@@ -249,10 +247,7 @@ def test_states_beyond_the_step_limit_that_have_an_end_are_found() -> None:
         ("Corridor-v0", {"variant": "fails"}, "a step with action 0 fails: no third cell"),
         ("Corridor-v0", {"size": 3}, "unexpected keyword argument 'size'"),
         ("DoubledCorridor-v0", {"limit": 20}, r"its reward is not .* \(2.0, enumerated as 1.0\)"),
-        ("MiniGrid-FourRooms-v0", {}, "a reset does not always lead to the same state"),
-        ("MiniGrid-Empty-Random-6x6-v0", {}, "a reset does not always lead to the same state"),
-        ("FrozenLake-v1", {}, "use env=gymnasium"),
-        ("Taxi-v4", {}, "the same state .* use env=gymnasium"),
+        ("MiniGrid-Empty-Random-6x6-v0", {}, r"may draw more than 500 times \(.*minigrid_env.py"),
         ("Pendulum-v1", {}, r"its actions are Box"),
         ("NoSuchWorld-v0", {}, "doesn't exist"),
     ],

@@ -203,7 +203,7 @@ def test_a_true_table_is_not_refused_however_it_is_stepped(kind: type[gym.Env[An
 def test_gymnasium_s_own_are_far_from_being_refused(
     env_id: str, kwargs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(table_walk, "_FALSE_ALARM", 0.01)
+    monkeypatch.setattr(table_walk, "FALSE_ALARM", 0.01)
     told = compile_gymnasium(env_id, kwargs).truth
     assert told.startswith("table P, checked by ")
     assert "support of all rows, " in told

@@ -1,0 +1,172 @@
+"""What can be known of a hidden state: the world whose states are exact distributions over it.
+
+A hidden state is all that an environment holds; what an agent gets is an observation, a reward and whether
+the episode is over. A state of the world is what these leave open after everything so far: a distribution
+over hidden states, the belief, and the last observation. Where the history determines the hidden state, as in
+a deterministic environment, a belief is one hidden state. No agent, whatever it remembers, does better than
+the optimum of this world, and one that remembers enough reaches it.
+
+Reference: K. J. Åström, Optimal control of Markov processes with incomplete state information, 1965.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gridworld.base.errors import InputError
+from gridworld.world.outcomes import Outcomes, check_size
+
+Belief = tuple[tuple[int, Fraction], ...]  # hidden states, ascending, with their probabilities
+_MOST_PARTS = 2_000_000  # hidden states of all beliefs together
+_MOST_BITS = 4_096  # bits of a probability, which a history without end makes longer and longer
+
+
+class Step(NamedTuple):
+    """One outcome of an action in a hidden state, or in a belief."""
+
+    probability: Fraction
+    following: int  # the number of a hidden state, or of a node
+    seen: bytes  # a digest of the observation
+    reward: float
+    terminated: bool
+    truncated: bool
+
+
+def lumped(steps: Sequence[Sequence[Sequence[Step]]]) -> list[int]:
+    """The number of each hidden state's class: states of one class look and pay alike, whatever is done.
+
+    They differ in what nothing depends on, such as the colour of a picture; `steps` as in `Beliefs`, where a
+    negative number is an end.
+
+    Reference: K. G. Larsen and A. Skou, Bisimulation through probabilistic testing, 1991.
+    """
+    classes, size = [int(bool(rows)) for rows in steps], 0
+    while size < (size := len(set(classes))):
+        numbers: dict[Any, int] = {}
+        found = []
+        for own, rows in zip(classes, steps, strict=True):
+            signature: list[Any] = [own]
+            for row in rows:
+                sums: dict[Any, Fraction] = {}
+                for probability, following, *shown in row:
+                    key = classes[following] if following >= 0 else following, *shown
+                    sums[key] = sums[key] + probability if key in sums else probability
+                signature.append(frozenset(sums.items()))
+            found.append(numbers.setdefault(tuple(signature), len(numbers)))
+        classes = found
+    return classes
+
+
+@dataclass
+class Node:
+    """A belief and the observation with which it came."""
+
+    belief: Belief
+    seen: bytes
+    rows: list[list[Step]] = field(default_factory=list)  # by actions; empty where none was tried
+
+
+class Beliefs:
+    """All beliefs that histories from the start lead to, breadth first.
+
+    Args:
+        starts: the probability of each hidden state and observation after a reset.
+        steps: of each hidden state the outcomes of each action; empty where none was tried.
+        refusal: makes an error of a reason.
+        most: more nodes are refused.
+    """
+
+    def __init__(
+        self,
+        starts: Iterable[tuple[Fraction, int, bytes]],
+        steps: Sequence[Sequence[Sequence[Step]]],
+        refusal: Callable[[str], InputError],
+        most: int,
+    ) -> None:
+        self._refusal, self._most, self._num_parts = refusal, most, 0
+        self.nodes: list[Node] = []
+        self._numbers: dict[tuple[Belief, bytes], int] = {}
+        first: dict[bytes, list[tuple[int, Fraction]]] = {}
+        for probability, hidden, seen in starts:
+            first.setdefault(seen, []).append((hidden, probability))
+        self.starts = [self._node(parts, seen) for seen, parts in first.items()]  # probability and node
+        for node in self.nodes:  # which grows
+            held = [(steps[number], probability) for number, probability in node.belief]
+            if all(each for each, _ in held):
+                node.rows = [
+                    self._row([(each[action], probability) for each, probability in held])
+                    for action in range(len(held[0][0]))
+                ]
+
+    def _row(self, hidden: Sequence[tuple[Sequence[Step], Fraction]]) -> list[Step]:
+        groups: dict[tuple[bytes, float, bool, bool], list[tuple[int, Fraction]]] = {}
+        for steps, share in hidden:
+            for each in steps:
+                parts = groups.setdefault((each.seen, each.reward, each.terminated, each.truncated), [])
+                parts.append((each.following, share * each.probability))
+        return [Step(*self._node(parts, seen), seen, *rest) for (seen, *rest), parts in groups.items()]  # type: ignore[arg-type]
+
+    def _node(self, parts: list[tuple[int, Fraction]], seen: bytes) -> tuple[Fraction, int]:
+        """The probability of these hidden states together, and the number of the node that they are."""
+        if len(parts) == 1:
+            total = parts[0][1]
+            belief: Belief = ((parts[0][0], Fraction(1)),)
+        else:
+            sums: dict[int, Fraction] = {}
+            for hidden, probability in parts:
+                sums[hidden] = sums.get(hidden, Fraction(0)) + probability
+            total = sum(sums.values(), Fraction(0))
+            belief = tuple((hidden, sums[hidden] / total) for hidden in sorted(sums))
+        key = belief, seen
+        if key not in self._numbers:
+            self._numbers[key] = len(self.nodes)
+            self.nodes.append(Node(belief, seen))
+            self._num_parts += len(belief)
+            is_long = max(each.denominator.bit_length() for _, each in belief) > _MOST_BITS
+            if len(self.nodes) > self._most or self._num_parts > _MOST_PARTS or is_long:
+                raise self._refusal(
+                    f"what histories say of its hidden state has no end: after {len(self.nodes):,} different "
+                    f"distributions of {self._num_parts:,} probabilities there are more; show more of the "
+                    "state, or set a limit (env.kwargs.max_episode_steps)"
+                )
+        return total, self._numbers[key]
+
+    def outcomes(self, name: str, num_actions: int) -> Outcomes:
+        """Its tables; a node in which nothing was tried stays as it is."""
+        size = len(self.nodes)
+        width = max((len(row) for node in self.nodes for row in node.rows), default=1)
+        check_size(name, size, num_actions, width)
+        table = np.zeros((4, size, num_actions, width))
+        table[0] = np.arange(size)[:, None, None]
+        table[1, :, :, 0] = 1.0
+        for number, node in enumerate(self.nodes):
+            for action, row in enumerate(node.rows):
+                table[:, number, action, : len(row)] = np.array(
+                    [(each.following, float(each.probability), each.reward, each.terminated) for each in row]
+                ).T
+        start = np.zeros(size)
+        for probability, number in self.starts:
+            start[number] = float(probability)
+        ends, reward = table[3] > 0, table[2]
+        paid = ends & (reward > 0)
+        return Outcomes(
+            next_state=table[0].astype(np.int64),
+            probability=table[1],
+            reward=reward,
+            terminated=ends,
+            start=start,
+            success=paid if paid.any() else None,
+        )
+
+    def num_aliased(self) -> int:
+        """How many observations stand for several nodes in which something is to be done."""
+        acting: dict[bytes, int] = {}
+        for node in self.nodes:
+            if node.rows:
+                acting[node.seen] = acting.get(node.seen, 0) + 1
+        return sum(number > 1 for number in acting.values())

@@ -1,0 +1,150 @@
+"""A number from an interval that is not drawn: what it is compared with splits the interval."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from numbers import Real
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from gridworld.world.branching import Branching
+
+MOST_OUTCOMES = 10_000  # of one draw
+
+
+class Uniform:
+    """`scale` * u + `offset`, where all that is known of u is the interval of [0, 1) that it is in."""
+
+    __slots__ = ("_branching", "_drawn", "_interval", "_offset", "_run", "_scale")
+
+    def __init__(
+        self,
+        branching: Branching,
+        drawn: str,
+        interval: list[Fraction],
+        scale: Fraction,
+        offset: Fraction,
+    ) -> None:
+        self._branching, self._run, self._drawn = branching, branching.run, drawn
+        self._interval, self._scale, self._offset = interval, scale, offset
+
+    def _refuse(self, *_: Any, **__: Any) -> Any:
+        self._branching.refuse(
+            "a random number is used for more than comparisons with thresholds", drawn=self._drawn
+        )
+
+    __float__ = __bool__ = __complex__ = __index__ = __round__ = __hash__ = __str__ = __repr__ = _refuse
+    __eq__ = __ne__ = __abs__ = __pow__ = __rpow__ = __mod__ = __rmod__ = __floordiv__ = _refuse
+    __rfloordiv__ = __divmod__ = __rdivmod__ = __rtruediv__ = __ceil__ = __format__ = _refuse
+    __reduce_ex__ = _refuse
+
+    def _among(self, cuts: Sequence[Fraction]) -> Fraction:
+        """Split the interval at the cuts that are in it; returns where the part begins that u is in."""
+        if self._run != self._branching.run:
+            self._branching.refuse("a random number is kept beyond its step", drawn=self._drawn)
+        low, high = self._interval
+        edges = [low, *sorted({cut for cut in cuts if low < cut < high}), high]
+        if len(edges) > 2:
+            if len(edges) > MOST_OUTCOMES:
+                self._refuse()
+            weights = tuple((end - start) / (high - low) for start, end in itertools.pairwise(edges))
+            part = self._branching.decide(weights)
+            self._interval[:] = edges[part : part + 2]
+        return self._interval[0]
+
+    def _is_below(self, threshold: Any) -> Any:
+        """Whether it is less than a threshold, or than each of an array."""
+        if threshold is self:  # numpy's search compares what it looks for with itself
+            return False
+        given = np.asarray(threshold)
+        if given.dtype.kind not in "biuf" or self._scale == 0 or np.isnan(given).any():
+            self._refuse()
+        finite = np.where(np.isfinite(given), given, 0).ravel().tolist()
+        cuts = [(Fraction(each) - self._offset) / self._scale for each in finite]
+        infinite = np.isinf(given).ravel()
+        start = self._among([cut for cut, is_not in zip(cuts, infinite, strict=True) if not is_not])
+        found = np.array([(cut > start) == (self._scale > 0) for cut in cuts], dtype=np.bool_)
+        found = np.where(infinite, given.ravel() > 0, found).reshape(given.shape)
+        return bool(found) if given.ndim == 0 else found
+
+    __lt__ = __le__ = _is_below  # to be just at a threshold has no probability
+
+    def _is_above(self, threshold: Any) -> Any:
+        return np.logical_not(below) if np.ndim(below := self._is_below(threshold)) else not below
+
+    __gt__ = __ge__ = _is_above
+
+    def __floor__(self) -> int:
+        edges = [self._scale * each + self._offset for each in self._interval]
+        whole = range(math.floor(min(edges)), math.ceil(max(edges)))
+        if self._scale == 0 or len(whole) > MOST_OUTCOMES:
+            self._refuse()
+        start = self._among([(each - self._offset) / self._scale for each in whole])
+        middle = (start + self._interval[1]) / 2
+        return math.floor(self._scale * middle + self._offset)
+
+    def __int__(self) -> int:
+        if self._scale * self._interval[0] + self._offset < 0:
+            self._refuse()
+        return self.__floor__()
+
+    __trunc__ = __int__
+
+    def _changed(self, other: Any, change: Callable[[Fraction], tuple[Fraction, Fraction]]) -> Any:
+        if isinstance(other, np.ndarray) and other.ndim:
+            return self._refuse()
+        if not isinstance(other, Real | np.ndarray) or not math.isfinite(other):
+            return self._refuse()
+        scale, offset = change(Fraction(float(other)))
+        return Uniform(self._branching, self._drawn, self._interval, scale, offset)
+
+    def __add__(self, other: Any) -> Any:
+        return self._changed(other, lambda number: (self._scale, self._offset + number))
+
+    def __mul__(self, other: Any) -> Any:
+        return self._changed(other, lambda number: (self._scale * number, self._offset * number))
+
+    def __truediv__(self, other: Any) -> Any:
+        return self._changed(other, lambda number: (self._scale / number, self._offset / number))
+
+    def __sub__(self, other: Any) -> Any:
+        return self._changed(other, lambda number: (self._scale, self._offset - number))
+
+    def __rsub__(self, other: Any) -> Any:
+        return self._changed(other, lambda number: (-self._scale, number - self._offset))
+
+    def __neg__(self) -> Any:
+        return 0 - self
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **_: Any) -> Any:
+        """What numpy makes of it, with an array or a number on either side."""
+        name = ufunc.__name__
+        if method == "__call__" and name in ("floor", "trunc"):
+            return np.float64(self.__floor__() if name == "floor" else self.__int__())
+        if method != "__call__" or len(inputs) != 2 or name not in _OPERATIONS:
+            return self._refuse()
+        ours, theirs = _OPERATIONS[name]
+        one, other = inputs
+        if isinstance(one, Uniform):
+            return self._refuse() if isinstance(other, Uniform) else getattr(one, ours)(other)
+        return getattr(other, theirs)(one)
+
+
+_OPERATIONS = {  # by the name of numpy's function: for it on the left, and on the right
+    "less": ("__lt__", "__gt__"),
+    "less_equal": ("__le__", "__ge__"),
+    "greater": ("__gt__", "__lt__"),
+    "greater_equal": ("__ge__", "__le__"),
+    "add": ("__add__", "__radd__"),
+    "multiply": ("__mul__", "__rmul__"),
+    "subtract": ("__sub__", "__rsub__"),
+    "true_divide": ("__truediv__", "__rtruediv__"),
+    "divide": ("__truediv__", "__rtruediv__"),
+}

@@ -1,0 +1,498 @@
+"""Random environments become exact worlds, against tables written by hand; what hides chance is refused."""
+
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.envs.toy_text import blackjack
+from helpers.support import configure
+
+from gridworld.base.errors import InputError
+from gridworld.config.worlds import GymnasiumConfig
+from gridworld.training.setup import notes
+from gridworld.world.evaluation import Evaluator
+from gridworld.world.mdp import Mdp
+from gridworld.world.memoryless import cost_of_own_observation
+from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
+from gridworld.world.snapshots import Snapshots
+from gridworld.world.sources import beliefs
+from gridworld.world.sources.enumerated import enumerate_env
+from gridworld.world.sources.gymnasium_table import compile_gymnasium
+
+GAMMA = 0.9
+
+
+class World(gym.Env[Any, int]):
+    """A number that `move` and `begin` change; what is seen of it, `show`, may be less."""
+
+    observation_space: gym.Space[Any] = spaces.Discrete(100)
+    size, limit, actions = 5, 0, 2
+    action_space: gym.Space[Any]
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.action_space = spaces.Discrete(self.actions)
+        self.render_mode = render_mode
+        self.made()
+
+    def made(self) -> None: ...
+
+    def begin(self) -> Any:
+        return 0
+
+    def move(self, action: int) -> tuple[Any, float, bool]:
+        raise NotImplementedError
+
+    def show(self) -> Any:
+        return self.at
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.at = self.begin()
+        return self.show(), {}
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.at, reward, over = self.move(action)
+        return self.show(), reward, over, False, {}
+
+
+@pytest.fixture
+def compiled() -> Iterator[Callable[..., Mdp]]:
+    made: list[str] = []
+
+    def compile_class(kind: type[World], **kwargs: Any) -> Mdp:
+        gym.register(f"{kind.__name__}-v0", entry_point=kind)
+        made.append(f"{kind.__name__}-v0")
+        return enumerate_env(made[-1], **kwargs)
+
+    yield compile_class
+    for name in made:
+        gym.registry.pop(name, None)
+
+
+class Inventory(World):
+    """Up to four items: orders arrive at once, demand is binomial, and what is left costs."""
+
+    actions = 3
+
+    def move(self, action: int) -> tuple[int, float, bool]:
+        stock = min(self.at + action, 4)
+        sold = min(stock, int(self.np_random.binomial(3, 0.4)))
+        return stock - sold, 2.0 * sold - action - 0.1 * stock, False
+
+
+def _inventory() -> Iterator[tuple[int, int, float, int, float, bool]]:
+    demand = [0.6**3, 3 * 0.4 * 0.36, 3 * 0.16 * 0.6, 0.4**3]
+    for state, action, (wanted, chance) in itertools.product(range(5), range(3), enumerate(demand)):
+        stock = min(state + action, 4)
+        sold = min(stock, wanted)
+        yield state, action, chance, stock - sold, 2.0 * sold - action - 0.1 * stock, False
+
+
+class Shower(World):
+    """Nine temperatures: the tap turns by one, the boiler by -1, 0 or 1; it ends after the draw of a bell."""
+
+    actions, size = 3, 9
+
+    def begin(self) -> int:
+        return int(self.np_random.integers(3, 6))
+
+    def move(self, action: int) -> tuple[int, float, bool]:
+        noise = self.np_random.choice([-1, 0, 1], p=[0.25, 0.5, 0.25])
+        at = int(np.clip(self.at + action - 1 + noise, 0, 8))
+        return at, 1.0 if at == 4 else -1.0, bool(self.np_random.random() < 0.1)
+
+
+def _shower() -> Iterator[tuple[int, int, float, int, float, bool]]:
+    turns = zip([-1, 0, 1], [0.25, 0.5, 0.25], strict=True)
+    for state, action, (noise, chance) in itertools.product(range(9), range(3), turns):
+        at = min(max(state + action - 1 + noise, 0), 8)
+        for over, bell in ((True, 0.1), (False, 0.9)):
+            yield state, action, chance * bell, at, 1.0 if at == 4 else -1.0, over
+
+
+class Windy(World):
+    """A 3 x 4 grid in which wind lifts by a random number of rows in the inner columns; the goal ends it."""
+
+    actions, size = 4, 12
+
+    def move(self, action: int) -> tuple[int, float, bool]:
+        row, column = divmod(self.at, 4)
+        if column in (1, 2):  # a conditional draw
+            row -= int(self.np_random.random() * 3) if column == 2 else int(self.np_random.random() < 0.5)
+        row += (0, 1, 0, -1)[action]
+        column += (1, 0, -1, 0)[action]
+        at = 4 * min(max(row, 0), 2) + min(max(column, 0), 3)
+        return at, -1.0, at == 11
+
+
+def _windy() -> Iterator[tuple[int, int, float, int, float, bool]]:
+    winds = {0: [1.0], 1: [0.5, 0.5], 2: [1 / 3] * 3, 3: [1.0]}
+    for state, action in itertools.product(range(12), range(4)):
+        for lifted, chance in enumerate(winds[state % 4]):
+            row = min(max(state // 4 - lifted + (0, 1, 0, -1)[action], 0), 2)
+            column = min(max(state % 4 + (1, 0, -1, 0)[action], 0), 3)
+            yield state, action, chance, 4 * row + column, -1.0, 4 * row + column == 11
+
+
+def by_hand(rows: Iterator[tuple[int, int, float, int, float, bool]], kind: type[World], start: Any) -> Mdp:
+    """The world of a list of outcomes."""
+    shape, filled = (kind.size, kind.actions, 8), dict[tuple[int, int], int]()
+    tables = [np.zeros(shape, dtype) for dtype in (float, int, float, bool)]
+    for state, action, *outcome in rows:
+        column = filled.setdefault((state, action), 0)
+        filled[state, action] += 1
+        for table, value in zip(tables, outcome, strict=True):
+            table[state, action, column] = value
+    chance, following, reward, over = tables
+    made = Outcomes(next_state=following, probability=chance, reward=reward, terminated=over, start=start)
+    return mdp_from_outcomes("by hand", made)
+
+
+def rows_of(mdp: Mdp, name: Callable[[int], Any]) -> dict[Any, dict[Any, float]]:
+    """The outcomes of reachable states by what is shown of them."""
+    found: dict[Any, dict[Any, float]] = {}
+    for state, action in itertools.product(
+        np.flatnonzero(mdp.reachable & ~mdp.terminal), range(mdp.num_actions)
+    ):
+        row = found.setdefault((name(state), action), {})
+        for k in np.flatnonzero(mdp.probability[state, action]):
+            after = int(mdp.next_state[state, action, k])
+            key = name(after), float(mdp.reward[state, action, k]), bool(mdp.terminal[after])
+            row[key] = row.get(key, 0.0) + float(mdp.probability[state, action, k])
+    return found
+
+
+def same_world(one: Mdp, other: Mdp) -> None:
+    """Two worlds have the same rows, where one is known by its own observation, the other by its number."""
+    assert one.own_observation is not None
+    shown = one.own_observation
+    mine, theirs = rows_of(one, lambda s: int(shown[s])), rows_of(other, lambda s: int(other.number[s]))
+    assert mine.keys() == theirs.keys()
+    for key, row in theirs.items():
+        assert mine[key] == pytest.approx(row, abs=1e-12), key
+    ours, given = Evaluator(one, GAMMA, 50), Evaluator(other, GAMMA, 50)
+    assert ours.optimal_value == pytest.approx(given.optimal_value, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("kind", "rows", "start"),
+    [
+        (Inventory, _inventory, np.eye(5)[0]),
+        (Shower, _shower, np.array([0, 0, 0, 1, 1, 1, 0, 0, 0]) / 3),
+        (Windy, _windy, np.eye(12)[0]),
+    ],
+)
+def test_custom_environments_are_their_tables(compiled: Any, kind: Any, rows: Any, start: Any) -> None:
+    mdp = compiled(kind)
+    assert (
+        mdp.truth == f"enumerated, {mdp.num_states - int(mdp.terminal.sum())} states" or kind is not Inventory
+    )
+    assert "stand for several" not in mdp.truth
+    same_world(mdp, by_hand(rows(), kind, start))
+    assert mdp.state_name(int(mdp.start_states[0])).startswith("observation ")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs"),
+    [("FrozenLake-v1", {}), ("FrozenLake-v1", {"desc": ["SFH", "FFG"]})],
+)
+def test_gymnasiums_environments_are_their_tables(env_id: str, kwargs: dict[str, Any]) -> None:
+    mdp = enumerate_env(
+        env_id, kwargs, ignore=["P", "lastaction"]
+    )  # which the steps do not change, or not read
+    same_world(mdp, compile_gymnasium(env_id, kwargs))
+    assert mdp.action_names == ("0", "1", "2", "3")
+
+
+def cards(deck: list[int], sab: bool) -> float:
+    """The optimum of Blackjack by its rules: sums, aces and naturals, without a look at the environment."""
+    draws = [(card, deck.count(card) / len(deck)) for card in sorted(set(deck))]
+
+    def total(points: int, ace: bool) -> int:
+        return points + 10 if ace and points <= 11 else points
+
+    def dealer(points: int, ace: bool) -> dict[int, float]:
+        if total(points, ace) >= 17:
+            return {total(points, ace) if points <= 21 else 0: 1.0}
+        found: dict[int, float] = {}
+        for card, chance in draws:
+            for result, share in dealer(points + card, ace or card == 1).items():
+                found[result] = found.get(result, 0.0) + chance * share
+        return found
+
+    def stick(mine: int, up: int, natural: bool) -> float:
+        value = 0.0
+        for hidden, chance in draws:
+            if natural and sab:
+                value += chance * (sorted([up, hidden]) != [1, 10])
+                continue
+            for theirs, share in dealer(up + hidden, 1 in (up, hidden)).items():
+                value += chance * share * ((mine > theirs) - (mine < theirs))
+        return value
+
+    memo: dict[Any, float] = {}
+
+    def best(points: int, ace: bool, up: int, natural: bool) -> float:
+        if points > 21:
+            return -1.0
+        key = points, ace, up, natural
+        if key not in memo:
+            hit = sum(chance * best(points + card, ace or card == 1, up, False) for card, chance in draws)
+            memo[key] = max(hit, stick(total(points, ace), up, natural))
+        return memo[key]
+
+    return sum(
+        p * q * r * best(first + second, 1 in (first, second), up, sorted([first, second]) == [1, 10])
+        for (first, p), (second, q), (up, r) in itertools.product(draws, draws, draws)
+    )
+
+
+@pytest.mark.parametrize("sab", [True, False])
+def test_blackjack_with_few_cards_is_as_good_as_by_its_rules(
+    sab: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deck = [1, 7, 10, 10]
+    monkeypatch.setattr(blackjack, "deck", deck)
+    mdp = enumerate_env("Blackjack-v1", {"sab": sab})
+    assert Evaluator(mdp, 1.0, 100).optimal_value == pytest.approx(cards(deck, sab), abs=1e-12)
+    assert "beliefs about" in mdp.truth  # the dealer's second card is not seen
+    # Where a natural wins, 21 with an ace is one observation of two states.
+    assert ("observations stand for several of them" in mdp.truth) == sab
+    assert mdp.own_observation is not None
+    assert mdp.own_observation.shape == (mdp.num_states, 3)
+
+
+def test_hands_are_summed_up_only_as_the_known_source_reads_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = blackjack.BlackjackEnv()
+    assert Snapshots(env)._read_by is not None
+    assert Snapshots(type("Own", (blackjack.BlackjackEnv,), {})())._read_by is None
+    env.rounds = 3
+    assert Snapshots(env)._read_by is None
+    del env.rounds
+    monkeypatch.setattr(blackjack, "score", lambda hand: len(hand))
+    assert Snapshots(env)._read_by is None
+
+
+@pytest.mark.slow
+def test_blackjack_is_worth_what_it_is_worth() -> None:
+    deck = [*range(1, 11), 10, 10, 10]
+    mdp = GymnasiumConfig(id="Blackjack-v1", kwargs={"sab": False}).compile()
+    value = Evaluator(mdp, 1.0, 100).optimal_value
+    assert value == pytest.approx(cards(deck, False), abs=1e-12)
+    assert value == pytest.approx(-0.0465559770667, abs=1e-9)
+
+
+class Hidden(World):
+    """Which of two doors has the prize is drawn by the reset; looking (2) tells by light or dark."""
+
+    actions = 3
+
+    def begin(self) -> tuple[int, int]:
+        return int(self.np_random.integers(2)), 2
+
+    def move(self, action: int) -> tuple[tuple[int, int], float, bool]:
+        door, _ = self.at
+        if action == 2:
+            is_right = self.np_random.random() < self.clear
+            return (door, door if is_right else 1 - door), -0.1, False
+        return (door, 2), float(action == door), True
+
+    clear = 1.0
+
+    def show(self) -> int:
+        return self.at[1]  # type: ignore[no-any-return]
+
+
+def test_an_optimum_that_nobody_can_reach_is_not_claimed(compiled: Any) -> None:
+    mdp = compiled(Hidden)
+    judge = Evaluator(mdp, 1.0, 50)
+    assert judge.optimal_value == pytest.approx(0.9)  # to look first; who knew the door would have 1
+    assert mdp.truth == "enumerated, 4 beliefs about 2 hidden states"
+    blind = np.zeros((mdp.num_states, 3))
+    blind[:, 0] = 1
+    assert judge.score(blind).value == 0.5
+
+
+def test_beliefs_without_end_are_refused(compiled: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(beliefs, "_MOST_BITS", 256)
+    faint = type("Faint", (Hidden,), {"clear": 0.75})  # evidence adds up for as long as one looks
+    with pytest.raises(InputError, match=r"has no end: after [\d,]+ different distributions"):
+        compiled(faint)
+
+
+class Delayed(World):
+    """A signal at the start says which action pays in the second step, where nothing of it is seen."""
+
+    def begin(self) -> tuple[int, int]:
+        return int(self.np_random.integers(2)), 0
+
+    def move(self, action: int) -> tuple[tuple[int, int], float, bool]:
+        signal, steps = self.at
+        return (signal, steps + 1), float(steps == 1 and action == signal), steps == 1
+
+    def show(self) -> int:
+        return self.at[0] if self.at[1] == 0 else 2  # type: ignore[no-any-return]
+
+
+def test_an_observation_of_several_beliefs_is_said(compiled: Any) -> None:
+    mdp = compiled(Delayed)
+    assert mdp.truth.endswith("; 1 observations stand for several of them")
+    judge = Evaluator(mdp, 1.0, 50)
+    assert judge.optimal_value == 1.0  # with memory
+    assert mdp.own_observation is not None
+    by_observation = np.eye(2)[np.where(mdp.own_observation == 2, 1, 0)]
+    score = judge.score(by_observation)
+    assert (score.value, score.certified) == (0.5, False)
+    assert cost_of_own_observation(mdp, 1.0) == 0.5
+    config = configure("env=enumerated", "env.id=Delayed-v0", "agent=dqn", "observation=own")
+    note = "1 observations stand for several states; a policy that sees no more has a regret of at least 0.49"
+    assert any(note in each for each in notes(config, mdp))
+
+
+class Coin(World):
+    """Each step pays a coin's side, and shows another coin; nothing else changes."""
+
+    def move(self, action: int) -> tuple[int, float, bool]:
+        return self.at, float(self.np_random.choice([0, 4])) * action, False
+
+    def show(self) -> int:
+        return int(self.np_random.integers(3))
+
+
+def test_random_rewards_and_observations(compiled: Any) -> None:
+    mdp = compiled(Coin)
+    assert mdp.num_states == 3
+    assert Evaluator(mdp, GAMMA, 50).optimal_value == pytest.approx(2 / (1 - GAMMA))
+
+
+class Named(World):
+    """The generator has another name too, also in something that it holds."""
+
+    def begin(self) -> int:
+        self.rng = self.np_random
+        self.held = {"again": [self.rng]}
+        return 0
+
+    def move(self, action: int) -> tuple[int, float, bool]:
+        draws = self.rng.integers(2) + self.held["again"][0].integers(2)
+        return int(draws), 1.0, False
+
+
+def test_the_generator_may_have_other_names(compiled: Any) -> None:
+    mdp = compiled(Named)
+    assert sorted(mdp.probability[0, 0].tolist()) == [0.25, 0.25, 0.5]
+
+
+_drawn = [0]
+
+
+def _closure() -> Any:
+    rng = np.random.default_rng(0)
+    return lambda: rng.integers(2)
+
+
+UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
+    "a number": (
+        {"move": lambda s, a: (0, float(s.np_random.random()), False)},
+        r"used for more than comparisons .*test_chance.py:\d+",
+    ),
+    "a reward that is a draw": (
+        {"move": lambda s, a: (0, s.np_random.random(), False)},
+        r"used for more than comparisons .*test_chance.py:\d+",
+    ),
+    "a state that is a draw": (
+        {"move": lambda s, a: (s.np_random.random(), 0.0, False), "show": lambda s: 0},
+        r"used for more than comparisons .*test_chance.py:\d+",
+    ),
+    "an observation that is a draw": (
+        {"move": lambda s, a: (0, 0.0, False), "show": lambda s: s.np_random.random()},
+        r"used for more than comparisons .*test_chance.py:\d+",
+    ),
+    "a normal draw": (
+        {"begin": lambda s: s.np_random.normal()},
+        r"np_random.normal\(\) .*test_chance.py:\d+",
+    ),
+    "the state of the generator": (
+        {"move": lambda s, a: (s.np_random.bit_generator.state["has_uint32"], 0.0, False)},
+        "bit_generator is used",
+    ),
+    "another generator": (
+        {
+            "made": lambda s: setattr(s, "rng", np.random.Generator(np.random.PCG64(3))),
+            "move": lambda s, a: (int(s.rng.integers(2)), 0.0, False),
+        },
+        "another generator than",
+    ),
+    "another generator in reset": (
+        {"begin": lambda s: int(np.random.default_rng().integers(2)), "move": lambda s, a: (0, 0.0, False)},
+        "numpy.random.default_rng",
+    ),
+    "a global generator in reset": (
+        {"begin": lambda s: int(np.random.rand() < 0.5), "move": lambda s, a: (0, 0.0, False)},
+        "another generator than",
+    ),
+    "a clock in reset": (
+        {"begin": lambda s: int(time.time()) % 2, "move": lambda s, a: (0, 0.0, False)},
+        "time.time",
+    ),
+    "a generator in a closure": (
+        {"made": lambda s: setattr(s, "draw", _closure()), "move": lambda s, a: (int(s.draw()), 0.0, False)},
+        "another generator than",
+    ),
+    "a bound method": (
+        {
+            "made": lambda s: setattr(s, "draw", s.np_random.integers),
+            "move": lambda s, a: (int(s.draw(2)), 0.0, False),
+        },
+        "holds numpy.random._generator.Generator.integers",
+    ),
+    "state outside": (
+        {"move": lambda s, a: (_drawn.append(0) or int(s.np_random.integers(2)), 0.0, False)},
+        "what is outside of its attributes",
+    ),
+    "a new generator in reset": (
+        {
+            "begin": lambda s: s.__dict__.update(_np_random=np.random.Generator(np.random.PCG64(1))) or 0,
+            "move": lambda s, a: (0, 0.0, False),
+        },
+        "makes another np_random",
+    ),
+    "one that is asked for its class": (
+        {
+            "move": lambda s, a: (
+                int(s.np_random.integers(4)) % 2
+                if type(s.np_random).__name__ == "Generator"
+                else int(s.np_random.integers(10) > 0),
+                0.0,
+                False,
+            )
+        },
+        "not as frequent as was enumerated",
+    ),
+    "an early end by chance": (
+        {"step": lambda s, a: (0, 0.0, False, bool(s.np_random.random() < 0.5), {})},
+        "truncates some episodes earlier",
+    ),
+    "too many states": (
+        {"move": lambda s, a: (s.at + int(s.np_random.integers(2)), 0.0, False), "show": lambda s: 0},
+        "more than 300 states",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", UNSOUND)
+def test_what_is_not_exact_is_refused(compiled: Any, what: str) -> None:
+    members, reason = UNSOUND[what]
+    with pytest.raises(InputError, match=f"^env.id=Unsound-v0: .*{reason}") as refused:
+        compiled(type("Unsound", (World,), members), most_states=300)
+    assert "\n" not in str(refused.value)
+
+
+def test_draws_of_pictures_do_not_matter(compiled: Any) -> None:
+    members = {"render": lambda self: self.np_random.normal(), "move": lambda self, action: (0, 1.0, False)}
+    assert compiled(type("Drawn", (World,), members)).num_states == 1
