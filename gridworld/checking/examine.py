@@ -34,8 +34,9 @@ from gridworld.world.sources.gymnasium_table import make_env
 from gridworld.world.wrappers import step_limit
 
 _STEPS = 20_000
-_MOST_STATES = 5_000  # to enumerate
-_SECONDS = 15.0  # for that
+_MOST_STATES = 3_000  # to enumerate
+_SECONDS = 10.0  # for that
+_OF_CHANCE = 30  # how much longer a state takes whose steps draw
 _WIDTH = 100
 Make = Callable[[], Env]
 
@@ -109,10 +110,10 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
             advice = "follow gymnasium.Env; gymnasium.utils.env_checker.check_env says more."
             finding = EnvFinding("interface", ERROR, problem, advice)
             return ExamineResult(name, (), (finding,), time.monotonic() - began)
-        mdp = _exact(first, make) if mdp is None else mdp
         started = time.monotonic()
         found = sample(make(), Actions(first.action_space, seed), steps, seed)
         rate, replayed = len(found.before) / max(time.monotonic() - started, 1e-3), Replays()
+        mdp = _exact(first, make, found.draws) if mdp is None else mdp
         try:
             replayed = replays(make, Actions(first.action_space, seed), rate)
         except Exception as error:  # anybody's code
@@ -199,7 +200,7 @@ def _interface(make: Make) -> str:
     return ""
 
 
-def _exact(env: Env, make: Make) -> Mdp | None:
+def _exact(env: Env, make: Make, draws: bool) -> Mdp | None:
     """The tables of an environment; None where it has none and cannot be enumerated."""
     try:
         return world_of(env)
@@ -208,14 +209,14 @@ def _exact(env: Env, make: Make) -> Mdp | None:
     name = f"gridworld-examined/E{uuid.uuid4().hex}-v0"
     gym.register(name, lambda **_: make())
     try:
-        return enumerate_env(name, most_states=_affordable(make()))
+        return enumerate_env(name, most_states=_affordable(make(), _OF_CHANCE if draws else 1))
     except Exception:  # it cannot be enumerated, or its code fails
         return None
     finally:
         del gym.registry[name]
 
 
-def _affordable(env: Env) -> int:
+def _affordable(env: Env, cost: int) -> int:
     """How many states can be enumerated in the time for it."""
     actions, snapshots, began, tries = (
         Actions(env.action_space, 0),
@@ -229,8 +230,8 @@ def _affordable(env: Env) -> int:
         snapshots.put_back(copy_)
         snapshots.key()
         env.step(actions.pool[0])
-    seconds = (time.perf_counter() - began) / tries * getattr(env.action_space, "n", 1)
-    return int(np.clip(_SECONDS / seconds, 200, _MOST_STATES))
+    seconds = (time.perf_counter() - began) / tries * getattr(env.action_space, "n", 1) * cost
+    return int(np.clip(_SECONDS / seconds, 100, _MOST_STATES))
 
 
 class _WorldEnv(gym.Env[Any, Any]):

@@ -34,7 +34,7 @@ _ADVICE = {
 def hidden(seen: Seen) -> tuple[str, str] | None:
     """The evidence and the advice; None where nothing is found."""
     pair, outcome, previous = _outcomes(seen)
-    found = (_by_chance if seen.is_stochastic else _by_conflict)(seen, pair, outcome, previous)
+    found = (_by_chance if seen.steps.draws else _by_conflict)(seen, pair, outcome, previous)
     return found or _by_regression(seen)
 
 

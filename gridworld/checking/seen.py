@@ -41,7 +41,7 @@ class Seen:
     @property
     def is_stochastic(self) -> bool:
         """Whether a step may draw."""
-        return self.steps.draws if self.mdp is None else self.mdp.is_stochastic
+        return self.steps.draws and (self.mdp is None or self.mdp.is_stochastic)
 
     @property
     def is_constant(self) -> bool:
