@@ -6,9 +6,11 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import notebook
 import option_tables
 
 import gridworld
+from gridworld.playground.page import maps_page
 
 project = "gridworld"
 author = "the gridworld maintainers"
@@ -31,15 +33,18 @@ html_css_files = ["site.css"]
 
 
 def setup(app):
-    """Have the tables of options filled in, and headings in docstrings set in bold."""
+    """Have options and the notebook filled in, docstrings' headings set in bold, the playground written."""
     app.connect("source-read", lambda app, name, source: fill(name, source))
+    app.connect("build-finished", lambda app, _: Path(app.outdir, "playground.html").write_text(maps_page()))
     app.connect("autodoc-process-docstring", lambda app, what, name, thing, options, lines: tidy(lines))
 
 
 def fill(name, source):
-    """Fill in the page of options."""
+    """Fill in the page of options and the notebook."""
     if name == "reference/options":
         source[0] = option_tables.fill(source[0])
+    if name == "tutorials/quickstart":
+        source[0] = source[0].replace("<!-- notebook -->", notebook.page())
 
 
 def tidy(lines):

@@ -1,7 +1,7 @@
 """The tables of options on the page `reference/options`, read from where the options are declared.
 
-Settings are fields of dataclasses; what one is for stands in the comment at the field or, where that has
-none, at the key in the yaml file that ships its value. A command's options are those of its parser.
+A setting is a field of a dataclass; its meaning is in the comment at the field or, where there is none, at
+the key in the yaml file that ships its value. A command's options are those of its parser.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ _ARGUMENT = re.compile(r"^\s*- ((?:`\w+`(?:, )?)+): (.*?)(?=^\s*- `|^\s*$)", re.
 
 
 def fill(text: str) -> str:
-    """Put the tables in the place of the lines `<!-- table: NAME -->`."""
+    """Replace the lines `<!-- table: NAME -->` by the tables."""
     return re.sub(r"<!-- table: ([\w/ ]+) -->", lambda found: TABLES[found[1]](), text)
 
 
 def environment_rows() -> list[Row]:
     """(name, default, meaning) of each argument of `gym.make` and `gym.make_vec`."""
-    told: dict[str, str] = {}
+    meanings: dict[str, str] = {}
     for names, meaning in _ARGUMENT.findall(inspect.getdoc(GridWorldEnv) + "\n\n"):
-        told |= dict.fromkeys(re.findall(r"\w+", names), " ".join(meaning.split()))
-    told |= {
+        meanings |= dict.fromkeys(re.findall(r"\w+", names), " ".join(meaning.split()))
+    meanings |= {
         "num_envs": "`make_vec` alone: environments that step together",
         "autoreset_mode": "`make_vec` alone: what follows an episode's end, see `GridWorldVectorEnv`",
         "stratified": "`make_vec` alone: whether environments share out outcomes, see `GridWorldVectorEnv`",
@@ -57,18 +57,18 @@ def environment_rows() -> list[Row]:
         for name, parameter in list(inspect.signature(kind.__init__).parameters.items())[1:]:
             defaults.setdefault(name, parameter.default)
     defaults["autoreset_mode"] = defaults["autoreset_mode"].value
-    return [(f"`{name}`", f"`{default}`", told[name].rstrip(".")) for name, default in defaults.items()]
+    return [(f"`{name}`", f"`{default}`", meanings[name].rstrip(".")) for name, default in defaults.items()]
 
 
 def setting_rows(schema: type, prefix: str = "") -> Iterator[Row]:
     """(key, type, default, meaning) of each setting; `prefix` is what its key begins with."""
-    hints, told, default = get_type_hints(schema), _comments(schema), schema()
+    hints, meanings, default = get_type_hints(schema), _comments(schema), schema()
     for each in fields(schema):
         key, value = f"{prefix}{each.name}", getattr(default, each.name)
         if is_dataclass(value) and not isinstance(value, AgentConfig | EnvConfig):
             yield from setting_rows(type(value), f"{key}.")
         elif each.name not in _NOT_SHOWN and not isinstance(value, AgentConfig | EnvConfig):
-            meaning = told.get(each.name) or _yaml_comments().get(key) or _of_sb3(schema)
+            meaning = meanings.get(each.name) or _yaml_comments().get(key) or _of_sb3(schema)
             yield f"`{key}`", f"`{_type(hints[each.name])}`", _value(value), _cell(meaning)
 
 

@@ -1,4 +1,4 @@
-"""Measure this project and its peers: `python scripts/benchmark.py`; see `--help`."""
+"""Measure the speed of this project and its peers: `python scripts/benchmark.py`; see `--help`."""
 
 from gridworld.base.signals import listen
 

@@ -1,4 +1,4 @@
-"""Hand finished runs to W&B, MLflow or the Hub: `python scripts/export.py runs/...`; see `--help`."""
+"""Export finished runs to W&B, MLflow or the Hub: `python scripts/export.py runs/...`; see `--help`."""
 
 from gridworld.base.signals import listen
 

@@ -1,4 +1,4 @@
-"""Show how the jobs of a sweep stand: `python scripts/jobs.py runs/...`; see `--help`."""
+"""Show the status of a sweep's jobs: `python scripts/jobs.py runs/...`; see `--help`."""
 
 from gridworld.base.signals import listen
 

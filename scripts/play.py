@@ -1,4 +1,4 @@
-"""Play a world with the arrow keys: `python scripts/play.py --layout maze`; see `--help`."""
+"""Play a world yourself: `python scripts/play.py env=maze`; see `--help`."""
 
 from gridworld.base.signals import listen
 

@@ -1,4 +1,4 @@
-"""Export a finished run's episodes as pictures: `python scripts/record.py runs/...`; see `--help`."""
+"""Draw a finished run's episodes and maps: `python scripts/record.py runs/...`; see `--help`."""
 
 from gridworld.base.signals import listen
 

@@ -1,4 +1,4 @@
-"""Put many runs side by side, as one page: `python scripts/report.py runs/...`; see `--help`."""
+"""Compare many runs on one page: `python scripts/report.py runs/...`; see `--help`."""
 
 from gridworld.base.signals import listen
 

@@ -1,4 +1,4 @@
-"""Run a run again and compare bit for bit: `python scripts/reproduce.py runs/...`; see `--help`."""
+"""Repeat a run and compare it bit for bit: `python scripts/reproduce.py runs/...`; see `--help`."""
 
 from gridworld.base.signals import listen
 

@@ -1,4 +1,4 @@
-"""Train an agent: `python scripts/train.py agent=dqn`; `--help` tells the rest."""
+"""Train an agent: `python scripts/train.py agent=dqn`; see `--help`."""
 
 from gridworld.base.signals import listen
 

@@ -74,19 +74,22 @@ def refusal(
 IN_TURN = {
     "clusters": ("sweep/test_sweep_cluster.py", "sweep/test_sweep_kills.py"),
     "browsers": ("training/test_tensorboard.py", "report/test_report_page.py"),
+    "playground": ("playground/test_numbers.py", "playground/test_page.py"),
 }
 # What takes more than ten seconds of a processor, the longest first.
 LONG = (
     *("clusters", "tests/test_docs.py", "sweep/test_sweep_population.py", "sweep/test_sweep.py"),
-    *("tune/test_tune.py", "browsers", "config/test_recipes.py", "tune/test_tune_parts.py"),
+    *("tune/test_tune.py", "browsers", "playground", "config/test_recipes.py", "tune/test_tune_parts.py"),
     *("commands/test_hostile_runs.py", "engine/test_populations.py", "api/test_certificates.py"),
     *("report/test_report.py", "config/test_config.py", "commands/test_bad_input.py"),
     *("commands/test_commands.py", "process/test_output.py"),
     *("diagnosis/test_sabotage.py", "restore/test_reproduce.py", "restore/test_resume.py"),
-    *("checking/test_check.py", "restore/test_resume_commands.py", "commands/test_train_on_worlds.py"),
+    *("checking/test_check.py", "checking/test_functions.py", "restore/test_resume_commands.py"),
+    "commands/test_train_on_worlds.py",
     *("export/test_export.py", "training/test_training.py"),
     *("agents/sb3/test_custom_code.py", "engine/test_updates.py", "restore/test_resume_states.py"),
     *("commands/test_console.py", "docs/test_examples.py", "config/test_presets.py"),
+    *("grading/test_course.py", "grading/test_grade.py"),
     *("agents/tabular/test_tabular.py", "process/test_forks.py", "api/test_runs.py", "api/test_sweeps.py"),
 )
 

@@ -2,14 +2,12 @@
 
 import ast
 import dataclasses
-import importlib.util
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from helpers.pages import PAGES, Reader, blocks, check
+from helpers.pages import PAGES, Reader, blocks, check, module_of
 from helpers.support import ROOT, configure
 
 import gridworld
@@ -70,6 +68,7 @@ TURNS = {
     r"in the place of": "instead of",
     r"gives? up": "cancel, abandon",
     r"(?<!there )is no (?!longer)\w+": "is not a",
+    r"\w*learnt": "learned",
 }
 
 
@@ -80,7 +79,16 @@ def unusual(text: str) -> dict[str, str]:
 
 def test_pages_messages_and_help_use_the_usual_words() -> None:
     """All strings of the package with a space, except docstrings; a command's docstring is its help."""
-    found = {page.stem: turns for page in PAGES if (turns := unusual(page.read_text("utf-8")))}
+    whole = [
+        *PAGES,
+        *(path for name in ("docs", "scripts") for path in (ROOT / name).rglob("*.py")),
+        *(ROOT / "conf").rglob("*.yaml"),
+        *(ROOT / "gridworld").rglob("*.j2"),
+        *(ROOT / name for name in ("docs/CITATION.cff", "docs/benchmarks/rl_zoo.yml", "pyproject.toml")),
+    ]
+    texts = {str(path.relative_to(ROOT)): path.read_text("utf-8") for path in whole}
+    texts["the notebook"] = re.sub(r"base64,[^)\"]+", "", module_of("notebook").page())
+    found = {name: turns for name, text in texts.items() if (turns := unusual(text))}
     for path in sorted((ROOT / "gridworld").rglob("*.py")):
         tree = ast.parse(path.read_text("utf-8"))
         docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
@@ -90,14 +98,11 @@ def test_pages_messages_and_help_use_the_usual_words() -> None:
             text = node.value if isinstance(node, ast.Constant) and id(node) not in docstrings else ""
             if isinstance(text, str) and " " in text and (turns := unusual(text)):
                 found[f"{path.relative_to(ROOT)}:{node.lineno}"] = turns
-    for path in sorted((ROOT / "conf").rglob("*.yaml")):
-        if turns := unusual(path.read_text("utf-8")):
-            found[str(path.relative_to(ROOT))] = turns
     assert not found
 
 
 def test_the_pictures_are_the_ones_that_a_command_draws() -> None:
-    figures = _module("figures")
+    figures = module_of("figures")
     assert {path.name for path in figures.IMAGES.iterdir()} == set(figures.SOURCES)
     assert sum(path.stat().st_size for path in figures.IMAGES.iterdir()) < 400_000
     for line in figures.COMMANDS.splitlines():
@@ -106,7 +111,7 @@ def test_the_pictures_are_the_ones_that_a_command_draws() -> None:
 
 def test_the_tables_of_options_are_complete() -> None:
     """Every setting, option and argument has a row, and every row says what it is for."""
-    tables = _module("option_tables")
+    tables = module_of("option_tables")
     page = (ROOT / "docs" / "reference" / "options.md").read_text("utf-8")
     assert set(re.findall(r"<!-- table: (\w+) -->", page)) == set(tables.TABLES)
     filled = tables.fill(page)
@@ -127,12 +132,3 @@ def test_the_tables_of_options_are_complete() -> None:
 def test_the_api_reference_has_every_public_name() -> None:
     page = (ROOT / "docs" / "reference" / "api.md").read_text("utf-8")
     assert set(re.findall(r"gridworld\.(\w+)\b", page)) >= set(gridworld.__all__)
-
-
-def _module(name: str) -> Any:
-    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module

@@ -15,7 +15,7 @@ from benchmarks.measure import Comparison, Workload
 
 from gridworld.base.errors import InputError
 
-_STEPS = 20_000  # of environment, beside RL Zoo
+_STEPS = 20_000  # of the environment, compared with RL Zoo
 
 
 def comparisons(workload: Workload) -> Iterator[Comparison]:

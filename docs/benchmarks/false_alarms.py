@@ -1,6 +1,6 @@
 """How rarely a right implementation fails a probe: a bound from how far it stays from each threshold.
 
-A trial tells which share of the way to its threshold an algorithm came: 1 or more has failed. With mean m
+A trial shows which share of the way to its threshold an algorithm came: 1 or more has failed. With mean m
 and variance v of this share over classes and seeds, Cantelli's inequality bounds the chance p of a failure by
 v / (v + (1 - m)²), whatever its distribution. A probe fails with two failures of three, so with a probability
 of at most 3 p².

@@ -1,4 +1,4 @@
-"""Populations: a sweep's runs that train together, beside one run alone."""
+"""Populations: a sweep's runs that train together, compared with one run alone."""
 
 from __future__ import annotations
 

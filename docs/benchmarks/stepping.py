@@ -19,7 +19,7 @@ _PEER = "Gymnasium's FrozenLake-v1"
 
 
 def comparisons(workload: Workload) -> Iterator[Comparison]:
-    """The single environment and batches, of states and of one-hot rows, beside FrozenLake's."""
+    """The single environment and batches, of states and of one-hot rows, compared with FrozenLake's."""
     lake: Any = gym.make("FrozenLake-v1").unwrapped
     lakes = gym.vector.SyncVectorEnv([lambda: gym.make("FrozenLake-v1")] * 64)
 

@@ -1,4 +1,4 @@
-"""Training: the engine beside stock SB3 on the same batch, and beside SB3 at its defaults."""
+"""Training: the engine compared with stock SB3 on the same batch, and with SB3 at its defaults."""
 
 from __future__ import annotations
 

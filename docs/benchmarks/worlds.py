@@ -1,4 +1,4 @@
-"""Gymnasium's own environments: compiling them, and training there beside SB3 with and without our batch."""
+"""Gymnasium's own environments: compiling them, training there, and SB3 with and without our batch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Train an agent and look at what it learnt: python docs/examples/train_and_look.py."""
+"""Train an agent and look at what it learned: python docs/examples/train_and_look.py."""
 
 import gridworld
 

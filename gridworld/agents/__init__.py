@@ -26,7 +26,7 @@ SafePoint = Callable[[int], None] | None
 
 @dataclass(frozen=True, eq=False)
 class PolicySnapshot:
-    """What an agent has learnt about every state at one moment: all that evaluation and pictures need."""
+    """What an agent has learned about every state at one moment: all that evaluation and pictures need."""
 
     greedy: IntArray  # (S,), the action of the greedy policy
     sampled: FloatArray  # (S, A), float64, the action probabilities of the policy that it explores with
@@ -61,7 +61,7 @@ class Agent(ABC):
     @property
     @abstractmethod
     def model(self) -> Any:
-        """What it has learnt, as its library has it: a model of SB3, or a table Q (S, A)."""
+        """What it has learned, as its library has it: a model of SB3, or a table Q (S, A)."""
 
     @abstractmethod
     def learn(
@@ -92,11 +92,11 @@ class Agent(ABC):
 
     @abstractmethod
     def snapshot(self) -> PolicySnapshot:
-        """What it has learnt so far, in arrays of their own."""
+        """What it has learned so far, in arrays of their own."""
 
     @abstractmethod
     def model_file(self) -> bytes:
-        """What it has learnt so far, as the content of a model file."""
+        """What it has learned so far, as the content of a model file."""
 
     @abstractmethod
     def load(self, path: Path) -> None:

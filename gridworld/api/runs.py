@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot
 from gridworld.api.settings import Override, words
+from gridworld.base.console import tell
 from gridworld.base.errors import InputError, failure
 from gridworld.base.signals import Interrupted
 from gridworld.base.user_input import limited
@@ -87,7 +88,7 @@ class RunResult:
 
     @cached_property
     def policy(self) -> PolicySnapshot:
-        """What was learnt, as tables `greedy` (S,), `sampled` (S, A), `values` (S,), `q` (S, A) or None."""
+        """What was learned, as tables `greedy` (S,), `sampled` (S, A), `values` (S,), `q` (S, A) or None."""
         return self.agent.snapshot()
 
     @property
@@ -250,8 +251,9 @@ def diagnose(
     with _torch_threads_kept(), limited():
         if isinstance(run, RunResult):
             folder, saved = run.folder, run.saved
+            words = None if saved.omission else run.overrides
             evidence = Evidence(
-                run.config, run.overrides, run.curve, run.visits, run.evaluator, run.agent, run.policy
+                run.config, words, run.curve, run.visits, run.evaluator, run.agent, run.policy
             )
         else:
             folder = Path(run).expanduser()
@@ -259,6 +261,8 @@ def diagnose(
             evidence = Evidence.of(saved)
         found = verdict.diagnose(evidence)
         if not try_offers:
+            if saved.omission:
+                tell(saved.omission)
             return found
         verdict.check_trusted(saved, found, trust)
         with tempfile.TemporaryDirectory(prefix="gridworld-") as elsewhere:

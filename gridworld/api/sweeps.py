@@ -231,9 +231,7 @@ def _run_command(name: str, words: Sequence[str], progress: bool) -> None:
 
 
 def _word(key: str, path: Path) -> str:
-    place = str(path.absolute())
-    is_plain = re.fullmatch(r"[\w./-]+", place)
-    return f"{key}={place if is_plain else literal(place, key)}"
+    return f"{key}={literal(str(path.absolute()), key)}"
 
 
 def _value(text: str) -> Any:

@@ -9,12 +9,13 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from numpy.typing import ArrayLike
 
+from gridworld.agents import PolicySnapshot
 from gridworld.base.bounds import discount
 from gridworld.base.errors import InputError
 from gridworld.config.compose import named_world
 from gridworld.envs.inspection import Task, task_of, world_of
 from gridworld.envs.vector_env import GridWorldVectorEnv
-from gridworld.world.chain import one_hot_policy
+from gridworld.world.chain import as_numbers, policy_of_table
 from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.mdp import FloatArray, Mdp
 
@@ -33,15 +34,15 @@ def evaluate(
     Args:
         model_or_table: a model of SB3 or of any library with its interface (DQN, PPO, A2C, QRDQN, TRPO, ...),
             or its policy, which acts as its `predict` does, with the environment's `action_masks()` if it
-            takes them; or a table: actions (S,), whole numbers from 0, or their probabilities (S, A);
-            by observations where the environment shows whole numbers.
+            takes them; a finished run, or its `policy`; or a table: actions (S,), whole numbers from 0, or
+            their probabilities (S, A); by observations where the environment shows whole numbers.
         env: an environment or a batch of Gymnasium or SB3: a GridWorld, or one with a transition table; a
             compiled world (`compile_mdp`, `compile_env`); a finished run; what `env=NAME` means on a command
             line, or an id of Gymnasium; or a map, its file or a `Layout`. The task is that of the
             environment with its wrappers, which must be neutral or functions; see
             `gridworld.world.wrappers`. A model sees states as this environment shows them; where that
             is the world's own observation of another kind, by the kind that has the model's observation
-            space. None: the environment that the model was trained on.
+            space. None: the environment that the model or run was trained on.
         gamma: discount of value and regret; None: 0.99, or a run's own `evaluation.gamma`.
         q: in place of `model_or_table`: Q values (S, A), of which the first of the best actions is taken.
         deterministic: whether to score a model's best action in every state, or the distribution that it
@@ -65,6 +66,13 @@ def evaluate(
     """
     if (model_or_table is None) == (q is None):
         raise InputError("evaluate: give either a model or table as the first argument, or q=...")
+    if isinstance(getattr(model_or_table, "evaluator", None), Evaluator):  # a run
+        env = model_or_table if env is None else env
+        model_or_table = model_or_table.policy
+    name = "the table" if q is None else "q"
+    if isinstance(model_or_table, PolicySnapshot):
+        name = "the run's policy"
+        model_or_table = model_or_table.greedy if deterministic else model_or_table.sampled
     is_model = hasattr(model_or_table, "observation_space")
     place = model_or_table.get_env() if env is None and hasattr(model_or_table, "get_env") else env
     if place is None:
@@ -89,40 +97,11 @@ def evaluate(
             )
         policy = tables.greedy if deterministic or tables.sampled is None else tables.sampled
     else:
-        policy = _policy(task, model_or_table if q is None else q, is_q=q is not None)
+        numbers = as_numbers(name, model_or_table if q is None else q, "a model, an opened run")
+        if np.isnan(numbers).any():
+            raise InputError(f"{name}: contains NaN")
+        policy = policy_of_table(mdp, name, _by_states(task, numbers), is_q=q is not None)
     return Evaluator(mdp, gamma, limit).score(policy)
-
-
-def _policy(task: Task, table: Any, is_q: bool) -> FloatArray:
-    """A table as probabilities (S, A) by states."""
-    mdp, name = task.mdp, "q" if is_q else "the table"
-    try:
-        numbers: FloatArray = np.asarray(table, dtype=np.float64)
-    except (TypeError, ValueError, RuntimeError):  # torch's, for a tensor with a gradient
-        kind = type(table).__name__
-        raise InputError(f"{name}: {kind} is neither a model nor a table of numbers") from None
-    if np.isnan(numbers).any():
-        raise InputError(f"{name}: contains NaN")
-    numbers, size = _by_states(task, numbers), mdp.num_states
-    if numbers.shape == (size,) and not is_q:
-        wrong = ~np.isin(numbers, np.arange(mdp.num_actions))
-        if wrong.any():
-            state = int(np.argmax(wrong))
-            raise InputError(
-                f"{name}: state {state} has the action {numbers[state]:g}; must be {mdp.action_choices()}"
-            )
-        return one_hot_policy(numbers.astype(np.int64), mdp.num_actions)
-    if numbers.shape != (size, mdp.num_actions):
-        either = "" if is_q else f"({size},) actions or "
-        raise InputError(
-            f"{name}: has shape {numbers.shape}; this world has {size} states and "
-            f"{mdp.num_actions} actions, so it must be {either}({size}, {mdp.num_actions})"
-        )
-    if is_q:
-        return one_hot_policy(numbers.argmax(axis=1), mdp.num_actions)
-    if (numbers < 0).any() or (np.abs(numbers.sum(axis=1) - 1) > 1e-4).any():
-        raise InputError(f"{name}: its rows are not probability distributions; give Q values as q=...")
-    return numbers
 
 
 def _by_states(task: Task, numbers: FloatArray) -> FloatArray:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 CONSOLE = "gridworld"
 _SCRIPTS = Path(__file__).parents[2] / "scripts"
-_SCRIPT = re.compile(r"(?:python )?(?:scripts/)?\b(train|tune|record|report|evaluate|jobs|play|check)\.py")
+_SCRIPT = re.compile(r"(?:python )?(?:scripts/)?\b([a-z]+)\.py(?!\w)")
 
 _LONGEST = 2000  # characters of a message
 _SECONDS_BETWEEN_LINES = 5.0
@@ -48,23 +48,23 @@ TOLD.propagate = False
 
 
 def command(name: str) -> str:
-    """What to type for a command, as this one was typed: `gridworld train`, `python scripts/train.py`."""
-    if _is_console():
+    """What to type for a command, as this one was typed: `gridworld train`, `python scripts/train.py`.
+
+    From Python or a program, it is `gridworld train`.
+    """
+    if not _is_script():
         return f"{CONSOLE} {name}"
-    folder = Path(sys.argv[0]).parent
-    if (users_folder() / sys.argv[0]).resolve().parent != _SCRIPTS.resolve():  # Python itself, or a program
-        folder = Path(_SCRIPTS.name)
-    return f"python {shlex.quote(str(folder / f'{name}.py'))}"
+    return f"python {shlex.quote(str(Path(sys.argv[0]).with_name(f'{name}.py')))}"
 
 
 def program(name: str) -> str:
     """A command's short name, for usage lines and messages: `train.py` or `gridworld train`."""
-    return f"{CONSOLE} {name}" if _is_console() else f"{name}.py"
+    return f"{name}.py" if _is_script() else f"{CONSOLE} {name}"
 
 
 def as_called(text: str) -> str:
     """A text that names scripts, such as a manual, with the commands in their place where those are used."""
-    return _SCRIPT.sub(rf"{CONSOLE} \1", text) if _is_console() else text
+    return text if _is_script() else _SCRIPT.sub(rf"{CONSOLE} \1", text)
 
 
 def command_line() -> list[str]:
@@ -79,8 +79,8 @@ def recorded_command_line() -> list[str]:
     return [*first.split(), *rest] if _is_console_word(first) else [Path(first).name, *rest]
 
 
-def _is_console() -> bool:
-    return _is_console_word(sys.argv[0]) or not (_SCRIPTS / "train.py").is_file()
+def _is_script() -> bool:
+    return (users_folder() / sys.argv[0]).resolve().parent == _SCRIPTS.resolve()
 
 
 def _is_console_word(first: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import pickle
 import textwrap
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +15,8 @@ from typing import Any
 
 from gridworld.base.console import aligned
 from gridworld.base.errors import InputError, in_short
-from gridworld.checking.probes import PROBES, Probe, UnmetError
+from gridworld.checking.function import ReturnedError
+from gridworld.checking.probes import PROBES, Probe, UnknownError, UnmetError
 from gridworld.checking.training import build, settings, subject, train
 from gridworld.config.train import AgentConfig
 
@@ -80,6 +82,9 @@ def check(
     seed: int = 0,
     processes: int = 1,
     on_finding: Callable[[Finding], None] = lambda finding: None,
+    *,
+    observation: str = "state",
+    steps: int | None = None,
 ) -> CheckResult:
     """Train an implementation on small worlds with known answers, and compare with the exact numbers.
 
@@ -87,25 +92,39 @@ def check(
     fails if it fails on two of three seeds.
 
     Args:
-        algorithm: a class with SB3's interface, its import path, or the name of a shipped agent. A class
-            trains in its own loop.
-        arguments: of its constructor, in place of those that the probes choose.
+        algorithm: a function `train(env, total_timesteps, seed)`, or module:function as text; or a class with
+            SB3's interface, its import path, or the name of a shipped agent, which trains in its own loop.
+            A function learns in a Gymnasium environment and returns its policy: a function of the observation
+            that returns an action or the probabilities of all, a table of actions (N,) or probabilities
+            (N, A) by observations, or a dictionary with such a `policy` or with `q` (N, A), or both, and
+            perhaps `values` (N,). If it takes `gamma`, that is each probe's; if not, only its policy
+            is checked.
+        arguments: of the function or the constructor, in place of those that the probes choose.
         probes: names; none: all.
         seed: the first of the three.
         processes: how many train at a time; 1: in this process.
         on_finding: called with every finding, in the order of the probes.
+        observation: what a function sees of a state: `state`, its number, or `one_hot`, a float32 vector.
+        steps: environment steps of a training run; None: 20,000 of a function, as many as its kind needs of
+            an agent.
 
     Returns:
         `passed`, `failed` (names), `findings` (a row for each probe); its text is the table.
 
     Raises:
-        InputError: no such implementation, probe or argument, or a class that refuses its arguments.
+        InputError: no such implementation, probe or argument; a class that refuses its arguments, or a
+            function that does not return a policy.
 
     Example:
         >>> check("q_learning").passed
         True
     """
-    config, given = subject(algorithm), dict(arguments or {})
+    config, given = subject(algorithm, observation), dict(arguments or {})
+    if processes > 1:
+        try:
+            pickle.dumps(config)
+        except (pickle.PicklingError, AttributeError, TypeError):
+            raise InputError(f"processes={processes}: needs a function that can be imported; use 1") from None
     started = time.monotonic()
     known = [probe.name for probe in PROBES]
     for name in probes:
@@ -119,7 +138,7 @@ def check(
         except InputError as error:
             raise InputError(str(error).replace("agent.arguments.", "--set ")) from None
     findings: list[Finding] = []
-    check_group = partial(_check_group, config, given, seed)
+    check_group = partial(_check_group, config, given, seed, steps)
     with ProcessPoolExecutor(max(1, min(processes, len(groups))), get_context("spawn")) as pool:
         for group in (map if processes == 1 else pool.map)(check_group, groups):
             findings += group
@@ -129,14 +148,15 @@ def check(
 
 
 def _check_group(
-    config: AgentConfig, given: Mapping[str, Any], seed: int, group: list[Probe]
+    config: AgentConfig, given: Mapping[str, Any], seed: int, steps: int | None, group: list[Probe]
 ) -> list[Finding]:
     """The findings of probes that share a training run; those that fail get further seeds."""
     started = time.monotonic()
     outcomes: dict[str, Outcomes] = {probe.name: [] for probe in group}
     for number in range(SEEDS):
         if unsettled := [probe for probe in group if not _is_settled(outcomes[probe.name])]:
-            for probe, outcome in zip(unsettled, _once(config, given, seed + number, unsettled), strict=True):
+            found = _once(config, given, seed + number, unsettled, steps)
+            for probe, outcome in zip(unsettled, found, strict=True):
                 outcomes[probe.name].append(outcome)
     seconds = (time.monotonic() - started) / len(group)
     return [
@@ -151,14 +171,20 @@ def _is_settled(outcomes: Outcomes) -> bool:
     return bool(outcomes) and (not failures or max(failures, len(outcomes) - failures) >= most)
 
 
-def _once(config: AgentConfig, given: Mapping[str, Any], seed: int, probes: list[Probe]) -> Outcomes:
+def _once(
+    config: AgentConfig, given: Mapping[str, Any], seed: int, probes: list[Probe], steps: int | None = None
+) -> Outcomes:
     """Train on one seed, and ask all probes of the group."""
     first = probes[0]
     if (found := settings(config, first, given)) is None:
         return [(None, f"takes no {first.needs}")] * len(probes)
     settled, kind = found
     try:
-        trained = train(settled, first.world, first.gamma, kind.num_envs, kind.steps, seed)
+        trained = train(settled, first.world, first.gamma, kind.num_envs, steps or kind.steps, seed)
+    except ReturnedError:
+        raise
+    except UnmetError as unmet:
+        return [(False, str(unmet))] * len(probes)
     except Exception as error:  # it may be anybody's code
         return [(False, f"training failed: {in_short(error)}")] * len(probes)
     outcomes: Outcomes = []
@@ -167,4 +193,6 @@ def _once(config: AgentConfig, given: Mapping[str, Any], seed: int, probes: list
             outcomes.append((True, probe.holds(trained)))
         except UnmetError as unmet:
             outcomes.append((False, str(unmet)))
+        except UnknownError as unknown:
+            outcomes.append((None, str(unknown)))
     return outcomes

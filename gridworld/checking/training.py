@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from gridworld.agents import Agent, TrainingContext
 from gridworld.agents.sb3.settings import SB3ClassConfig, SB3Config
 from gridworld.base.errors import InputError
+from gridworld.base.user_input import imported
+from gridworld.checking.function import OBSERVATIONS, FunctionConfig
 from gridworld.checking.probes import Probe, Trained
 from gridworld.config.train import AgentConfig
 from gridworld.envs.observations import make_observation
@@ -57,6 +59,7 @@ KINDS = (  # the first that fits: DQN and QR-DQN, TRPO, PPO, A2C, tables, others
                                             "initial_value": 0.0}),
     Kind("", 20_000, 8, {"learning_rate": 1e-3}),
 )
+FUNCTION = Kind("", 20_000, 1, {})  # it chooses its arguments itself
 # fmt: on
 
 
@@ -68,6 +71,8 @@ def settings(config: AgentConfig, probe: Probe, given: Mapping[str, Any]) -> tup
 
         algorithm = algorithm_class("check", config.algorithm)
         known = _arguments_of(algorithm)
+    elif isinstance(config, FunctionConfig):
+        known = config.known
     else:
         general = {field.name for field in dataclasses.fields(SB3Config)}
         known = sorted({field.name for field in dataclasses.fields(config)} - general)
@@ -78,6 +83,10 @@ def settings(config: AgentConfig, probe: Probe, given: Mapping[str, Any]) -> tup
             raise InputError(f"--set {name}: {config.name} has no such argument; it has {', '.join(known)}")
     if probe.needs and probe.needs not in known:
         return None
+    if isinstance(config, FunctionConfig):
+        wanted = {"gamma": probe.gamma, **given, **probe.arguments}
+        chosen = {name: wanted[name] for name in wanted if name in known}
+        return dataclasses.replace(config, arguments=chosen), FUNCTION
     kind = next(each for each in KINDS if each.sign in known or not each.sign)
     wanted = {**kind.arguments, "gamma": probe.gamma, **given, **probe.arguments}
     if isinstance(config, SB3ClassConfig):
@@ -110,8 +119,20 @@ def _arguments_of(kind: type) -> list[str]:
     return sorted(name for name in names - {"policy", "env"} if not name.startswith("_"))
 
 
-def subject(algorithm: Any) -> AgentConfig:
-    """The settings that name a class with SB3's interface, its import path, or a shipped agent."""
+def subject(algorithm: Any, observation: str = "state") -> AgentConfig:
+    """The settings of a train function, a class with SB3's interface or a shipped agent, also by name."""
+    if isinstance(algorithm, str) and ":" in algorithm:
+        found = imported("check", algorithm.replace(":", "."))
+        if not callable(found):
+            raise InputError(f"check {algorithm}: must be a function, as module:function")
+        return dataclasses.replace(subject(found, observation), name=algorithm)
+    if observation not in OBSERVATIONS:
+        raise InputError(f"observation={observation!r}: must be {' or '.join(OBSERVATIONS)}")
+    if callable(algorithm) and not inspect.isclass(algorithm):
+        name = getattr(algorithm, "__name__", type(algorithm).__name__)
+        return FunctionConfig(name=name, algorithm=name, train=algorithm, observation=observation)
+    if observation != "state":
+        raise InputError(f"observation={observation}: is for a train function; leave it out")
     if inspect.isclass(algorithm):
         algorithm = f"{algorithm.__module__}.{algorithm.__qualname__}"
     name = str(algorithm)
@@ -123,8 +144,8 @@ def subject(algorithm: Any) -> AgentConfig:
     known = sorted(file.stem for file in (conf_folder() / "agent").glob("*.yaml"))
     if name not in known:
         raise InputError(
-            f"check {name}: must be the import path of a class, e.g. my_package.MyPPO, or a shipped agent, "
-            f"which are {', '.join(known)}"
+            f"check {name}: must be a train function, e.g. my_agent:train, the import path of a class, e.g. "
+            f"my_package.MyPPO, or a shipped agent, which are {', '.join(known)}"
         )
     return compose([f"agent={name}"]).agent
 
@@ -147,6 +168,8 @@ def arguments(words: Sequence[str]) -> dict[str, Any]:
 def build(config: AgentConfig, mdp: Mdp, num_envs: int, seed: int) -> tuple[Agent, TrainingContext]:
     """Build an agent on a world."""
     kind = "none" if config.family == "tabular" else "one_hot"
+    if isinstance(config, FunctionConfig):
+        kind = OBSERVATIONS[config.observation]
     envs = StatisticsVectorEnv(num_envs, mdp=mdp, max_episode_steps=mdp.max_episode_steps)
     context = TrainingContext(envs, make_observation(mdp, kind), seed, "cpu")
     return config.build(context), context
@@ -171,7 +194,8 @@ def train(config: AgentConfig, mdp: Mdp, gamma: float, num_envs: int, steps: int
     if predict is not None:  # a table has none
         actions, _ = predict(context.observation.table(), deterministic=True)
         greedy = one_hot_policy(np.asarray(actions).astype(np.int64), mdp.num_actions)
-    return Trained(mdp, gamma, first, agent.snapshot(), greedy, visits, visits - earlier, frozen)
+    unknown = getattr(agent, "unknown", {})
+    return Trained(mdp, gamma, first, agent.snapshot(), greedy, visits, visits - earlier, frozen, unknown)
 
 
 def _parameters(agent: Agent) -> dict[str, NDArray[Any]]:

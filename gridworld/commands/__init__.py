@@ -31,11 +31,14 @@ COMMANDS = {
     "reproduce": "repeat a finished run and compare it bit for bit",
     "tune": "tune an agent's settings for a task, and confirm the winner",
     "check": "check an algorithm's implementation on worlds with known answers",
+    "grade": "mark a student's lab sheet of the course",
     "play": "play a world yourself, next to a trained agent if you like",
+    "playground": "draw worlds and watch tables learn, in the browser",
     "benchmark": "measure the speed of this project and its peers",
 }
 _MANUAL = """\
-A Stable-Baselines3 experiment harness whose ground truth is known.
+Train Stable-Baselines3 agents on worlds small enough to solve exactly, and know
+whether they are optimal, and if not, why.
 
 usage: {console} COMMAND ...
 
@@ -130,7 +133,7 @@ def _without_command(words: Sequence[str]) -> None:
     """Print the manual or the version."""
     word = words[0] if words else "--help"
     if word in ("--help", "-h", "help"):
-        commands = "\n".join(f"  {name:<11}{about}" for name, about in COMMANDS.items())
+        commands = "\n".join(f"  {name:<12}{about}" for name, about in COMMANDS.items())
         print(_MANUAL.format(console=CONSOLE, commands=commands))
         return
     if word == "--version":
@@ -140,6 +143,8 @@ def _without_command(words: Sequence[str]) -> None:
         return
     close = difflib.get_close_matches(word.removesuffix(".py"), COMMANDS, n=1)
     advice = f"did you mean {CONSOLE} {close[0]}?" if close else f"it is one of {', '.join(COMMANDS)}"
+    if word == "sweep":
+        advice = f"a sweep is {CONSOLE} train -m"
     if not close and "=" in word:
         advice = f"settings come after a command: {CONSOLE} train {word}"
     raise InputError(f"{CONSOLE}: unknown command {word}; {advice}")

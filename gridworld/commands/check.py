@@ -13,6 +13,7 @@ import textwrap
 from collections.abc import Sequence
 
 from gridworld.base.console import printable
+from gridworld.checking.function import OBSERVATIONS
 from gridworld.checking.probes import PROBES
 from gridworld.checking.run import check
 from gridworld.checking.training import arguments
@@ -31,6 +32,8 @@ def main(words: Sequence[str]) -> None:
         options.probe,
         options.seed,
         options.processes,
+        observation=options.observation,
+        steps=options.steps,
         on_finding=lambda finding: print(*map(printable, str(finding).splitlines()), sep="\n", flush=True),
     )
     print(printable(result.verdict()))
@@ -46,10 +49,14 @@ def _parser() -> argparse.ArgumentParser:
     epilog = f"The probes, and what a failure means:\n{probes}"
     parser = parser_of("check", __doc__, epilog=epilog)
     option = parser.add_argument
-    option("algorithm", help="a class like SB3's, e.g. my_package.MyPPO, or a shipped agent, e.g. dqn")
-    argument = "an argument for the class, e.g. learning_rate=0.001; may be repeated"
+    kinds = "my_agent:train, a function; my_package.MyPPO, a class like SB3's; or dqn, a shipped agent"
+    option("algorithm", help=kinds)
+    argument = "an argument for it, e.g. learning_rate=0.001; may be repeated"
     option("--set", action="append", default=[], metavar="NAME=VALUE", help=argument)
     option("--probe", action="append", default=[], metavar="NAME", help="only this probe; may be repeated")
+    shown = "what a train function sees of a state: its number, or a vector (default state)"
+    option("--observation", choices=tuple(OBSERVATIONS), default="state", help=shown)
+    option("--steps", type=whole(1), help="environment steps of a training run (default: 6,400 to 25,600)")
     option("--seed", type=whole(0), default=0, help="the first of up to three seeds (default 0)")
     processes = min(_PROCESSES, os.cpu_count() or 1)
     option("--processes", type=whole(1), default=processes, help="how many runs train at a time")

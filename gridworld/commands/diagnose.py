@@ -40,9 +40,12 @@ def main(arguments: Sequence[str]) -> None:
     if found.findings:
         print(_table(found))
     print(printable(found.sentence()))
-    if found.commands:
+    if found.findings and saved.omission:
+        print(printable(saved.omission))
+    elif found.commands:
         print("Try, one at a time:")
         print(*(printable(f"  {line}") for line in found.commands), sep="\n")
+    if found.findings:
         path = options.run / PICTURE
         try:
             check_no_link(path)

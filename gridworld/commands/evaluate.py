@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 from collections.abc import Sequence
 
 from gridworld.base.console import aligned, printable, program, telling_if_slow
@@ -64,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _table(evaluator: Evaluator, policy: FloatArray, score: Score, sampled: SampledScores) -> str:
-    """Exact scores beside the optimum, and beside sampled ones of the same horizon."""
+    """Exact scores, the optimum, and sampled scores of the same horizon; if narrow, intervals."""
     best = optimal_score(evaluator)
     estimates = {
         "goal_probability": sampled.goal,
@@ -75,17 +76,21 @@ def _table(evaluator: Evaluator, policy: FloatArray, score: Score, sampled: Samp
     }
     discounted = [f"{evaluator.discounted_return(each):.4g}" for each in (policy, evaluator.optimal_policy())]
     rows = [
-        ["", "exact", f" {sampled.episodes:,} episodes [95 %]", "optimum"],
+        ["", "exact", "optimum", f"{sampled.episodes:,} episodes [95 %]"],
         ["without a step limit:", "", "", ""],
-        ["value", f"{score.value:.4g}", "", f"{evaluator.optimal_value:.4g}"],
+        ["value", f"{score.value:.4g}", f"{evaluator.optimal_value:.4g}", ""],
         [f"within {evaluator.max_episode_steps:,} steps:", "", "", ""],
-        ["discounted return", discounted[0], f" {sampled.discounted_return}", discounted[1]],
+        ["discounted return", *discounted, str(sampled.discounted_return)],
     ]
     for metric in METRICS:
         if metric.within_limit:
             exact, optimum = (metric.text(metric.of(each)) for each in (score, best))
-            rows.append([metric.label, exact, f" {estimates.get(metric.name, '')}", optimum])
-    return "\n".join(f"  {line}" for line in aligned(rows, ("<22", ">9", "<27", ">9")))
+            rows.append([metric.label, exact, optimum, str(estimates.get(metric.name, ""))])
+    is_narrow = shutil.get_terminal_size().columns < 70
+    for row in rows:
+        row[3] = row[3][row[3].find("[") :] if is_narrow else f" {row[3]}"
+    rows[0][3] = "sampled [95 %]" if is_narrow else rows[0][3]
+    return "\n".join(f"  {line}" for line in aligned(rows, ("<20", ">8", ">8", "<0")))
 
 
 def _show(evaluator: Evaluator, policy: FloatArray, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""Show the status of a sweep's jobs, and update its jobs.csv, which a kill may have left behind."""
+"""Show the status of a sweep's jobs, and update its jobs.csv, which is out of date after a kill."""
 
 from __future__ import annotations
 

@@ -78,24 +78,25 @@ def manual() -> str:
 
 def choices(group: Path) -> list[str]:
     """A line for each yaml file in the folder of a group: its name and its first comment."""
-    lines = []
-    for file in sorted(group.glob("*.yaml")):
+    lines, files = [], sorted(group.glob("*.yaml"))
+    width = max((len(file.stem) for file in files), default=0)
+    for file in files:
         comments = [line[2:] for line in file.read_text("utf-8").splitlines() if line.startswith("# ")]
         about = next((comment for comment in comments if not comment.startswith("@package")), "")
-        lines.append(f"    {file.stem:<16} {about}")
+        lines.append(f"    {file.stem:<{width}}  {about}")
     return lines
 
 
 def _recipes(group: Path) -> list[str]:
     """A line or two per world, then those that are known to fail."""
-    files = sorted(group.glob("*.yaml"))
+    files = [file for file in sorted(group.glob("*.yaml")) if file.stem in pairs()]
     agents: dict[str, list[str]] = {}
     for file in files:
-        world, agent = pairs().get(file.stem, ("", file.stem))
+        world, agent = pairs()[file.stem]
         agents.setdefault(world, []).append(agent)
     lines = []
     for world, names in agents.items():
-        text = f"    {world + '_...' if world else '':<20} {', '.join(names)}"
-        lines += textwrap.wrap(text, 100, subsequent_indent=" " * 25, drop_whitespace=True)
+        text = f"    {world + '_...':<22}  {', '.join(names)}"
+        lines += textwrap.wrap(text, 100, subsequent_indent=" " * 28)
     failing = [file.stem for file in files if "known_failure:" in file.read_text("utf-8")]
     return [*lines, f"    Known to fail: {', '.join(failing)}"] if failing else lines

@@ -215,7 +215,7 @@ def _board(player: Player, cell_size: int, with_optimum: bool) -> Sheet:
 @limited()
 def main(arguments: Sequence[str]) -> None:
     """Open the window and play until it is closed."""
-    options = _parser().parse_args(arguments)
+    options = _parser().parse_intermixed_args(arguments)
     if options.best and options.agent is None:
         raise InputError("--best: chooses between the models of a run; add --agent RUN")
     with telling_if_slow("solving the world"):
@@ -264,7 +264,13 @@ def play(game: Game, cell_size: int) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("play", __doc__, "--best", "--trust")
     option = parser.add_argument
-    option("words", nargs="*", metavar="env=NAME", help="the world, as for train: env=cliff env.slip=0.1")
+    option(
+        "words",
+        nargs="*",
+        metavar="env=NAME",
+        help="the world, as for train: env=cliff env.slip=0.1, recipe=...",
+    )
+    option("--config-dir", action="append", default=[], help="a folder with your own yaml files")
     option("--layout", help="a shipped map's name or a map file (default classic)")
     for name, (kind, meaning) in _WORLD.items():
         option(f"--{name.replace('_', '-')}", type=kind, help=meaning)
@@ -280,9 +286,10 @@ def _game(options: argparse.Namespace) -> Game:
     given = {name: getattr(options, name) for name in _WORLD if getattr(options, name) is not None}
     if options.agent is not None and (fixed := [*options.words, *given.keys() & {"num_rows", "num_cols"}]):
         raise InputError(f"{fixed[0]}: with --agent, the world has the size it was trained on")
-    refuse_unclear(options.words)
+    words = [*options.words, *(f"--config-dir={each}" for each in options.config_dir)]
+    refuse_unclear(words)
     saved = None if options.agent is None else SavedRun(options.agent, options.trust, options.best)
-    config = saved.config if saved is not None else compose(options.words) if options.words else None
+    config = saved.config if saved is not None else compose(words) if words else None
     env = MapConfig() if config is None else config.env
     if isinstance(env, MapConfig):
         env = dataclasses.replace(env, **given)

@@ -1,4 +1,4 @@
-"""Draw a finished run: episodes as numbered PNGs, GIF, APNG or MP4, and maps of what it learnt."""
+"""Draw a finished run: episodes as numbered PNGs, GIF, APNG or MP4, and maps of what it learned."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ from gridworld.config.compose import VERSION_BASE, completed, register_schemas, 
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import conf_folder, own_conf_folders, refuse_unclear, sentence, unreadable_file
 from gridworld.run.folder import MANIFEST, SWEEP_JSON, alone_in, check_inside, claimed, shell_path
-from gridworld.run.reader import check_free, check_is_run, is_started
+from gridworld.run.reader import check_free, check_is, is_started
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 _RESUME, _STEPS = "resume", "total_timesteps"
@@ -177,13 +177,13 @@ def _train(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
         from gridworld.training.resume import unfinished_of
 
         run = unfinished_of(folder, config).resume
-    return float(train_and_tell(folder, run, _advice)["regret"])
+    return float(train_and_tell(folder, run, partial(_advice, trust=True))["regret"])
 
 
-def _advice(folder: Path) -> list[str]:
+def _advice(folder: Path, trust: bool) -> list[str]:
     from gridworld.training.advice import advice  # here, since most runs are certified
 
-    return advice(folder)
+    return advice(folder, trust)
 
 
 @limited()
@@ -198,7 +198,7 @@ def resume(words: Sequence[str]) -> None:
     progress, trust, anyway = (given.get(name, usual) == "true" for name, usual in _SWITCHES.items())
     folder = Path(given[_RESUME])
     check_inside(folder, _RESUME)
-    check_is_run(folder)  # before anything is written there
+    check_is(folder)  # before anything is written there
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: is read-only; copy the run to a writable folder and resume the copy")
 
@@ -207,7 +207,9 @@ def resume(words: Sequence[str]) -> None:
 
     with alone_in(folder):
         unfinished = open_unfinished(folder, trust)
-        train_and_tell(folder, lambda: unfinished.resume(steps, anyway, progress), _advice)
+        train_and_tell(
+            folder, lambda: unfinished.resume(steps, anyway, progress), partial(_advice, trust=trust)
+        )
 
 
 def _resume_words(arguments: Sequence[str]) -> dict[str, str]:

@@ -68,8 +68,6 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(f"--package {options.package}: shows a part of the configuration; use it with --cfg")
     if importlib.util.find_spec("optuna") is None:
         raise InputError(f"{program('tune')}: optuna is not installed; {install_command('tune')}")
-    if options.config_dir is not None and not options.config_dir.is_dir():
-        raise InputError(f"--config-dir {options.config_dir}: no such folder")
     own = (options.config_dir,) if options.config_dir is not None else ()
     from gridworld.sweeps.tune.study_spec import compose_study
 

@@ -24,6 +24,7 @@ from yaml import YAMLError
 
 from gridworld.base.errors import InputError
 from gridworld.config.presets import may_need_preset, with_preset
+from gridworld.config.recipe_file import literal, with_recipe
 from gridworld.config.settings import agent_schemas
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SearchConfig, SweepConfig
 from gridworld.config.train import TrainConfig
@@ -40,18 +41,20 @@ _NO_SINGLE_RUN = {  # with these of Hydra's options, a command line is not that 
     *("-m", "--multirun", "--hydra-help", "--info", "-i", "--shell-completion", "-sc"),
     *("--config-name", "-cn", "--config-path", "-cp", "--experimental-rerun"),
 }
-_PLAIN = re.compile(r"[\w./:-]+")  # what Hydra takes without quotes
 
 
 def compose(words: Sequence[str]) -> TrainConfig:
     """Compose the configuration that a command line of these words would give to a run.
 
-    It may be called in any thread, and in a program that uses Hydra itself.
+    It may have `--config-dir` and `recipe=`. It may be called in any thread, and in a program that uses Hydra
+    itself.
     """
+    own = list(own_conf_folders(words))
+    values = with_recipe([word for at, word in enumerate(words) if is_override(words, at)])
     try:
         with _leaving_hydra_as_it_was():
             _store_schemas()
-            return compose_run(conf_folder(), words)[0]
+            return compose_run(conf_folder(), [*search_path(own), *values])[0]
     except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
         raise InputError(sentence(error)) from None
 
@@ -108,19 +111,20 @@ def completed(words: Sequence[str]) -> list[str]:
     values = [found[number] for number in places]
     if {word.partition("=")[0] for word in found} & _NO_SINGLE_RUN or not (own or may_need_preset(values)):
         return found
-    folders = search_path([conf_folder()] if own else [])
     chosen: list[str] = []
     with contextlib.suppress(Exception):  # Hydra composes again, and says what is wrong
-        chosen = compose_run([*own, conf_folder()][0], [*folders, *values])[2]
+        chosen = compose_run(conf_folder(), [*search_path(own), *values])[2]
     end = places[-1] + 1 if places else len(found)  # options may follow
     return [*found[:end], *chosen, *found[end:]]
 
 
 def search_path(folders: Sequence[Path]) -> list[str]:
     """The word by which Hydra searches these folders too, if there are any."""
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"--config-dir {folder}: no such folder")
     places = [f"file://{folder.resolve()}" for folder in folders]
-    quoted = [place if _PLAIN.fullmatch(place) else f"'{place}'" for place in places]
-    return [f"hydra.searchpath=[{','.join(quoted)}]"] if folders else []
+    return [f"hydra.searchpath={literal(places, 'hydra.searchpath')}"] if folders else []
 
 
 @contextlib.contextmanager

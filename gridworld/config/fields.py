@@ -34,9 +34,9 @@ _OF_KEYWORD = r"[\w+-]*"
 class Effect(Enum):
     """On what a setting has an effect. Runs that differ in the last two alone have the same result."""
 
-    LEARNING = auto()  # what is learnt
+    LEARNING = auto()  # what is learned
     LENGTH = auto()  # for how long
-    TASK = auto()  # what is to be learnt: the world, and the discount of the evaluation
+    TASK = auto()  # what is to be learned: the world, and the discount of the evaluation
     EVALUATION = auto()  # when policies are evaluated, and at which result training ends
     SEED = auto()  # the random numbers
     MACHINE = auto()  # what it is computed on

@@ -8,6 +8,7 @@ settings that the schema has. What comes out are plain overrides, quoted.
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,8 +21,9 @@ from omegaconf import OmegaConf
 from gridworld.base.bounds import LARGEST_INTEGER
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import as_text, read_bytes
+from gridworld.base.user_input import users_folder
 from gridworld.config.fields import MISSING
-from gridworld.config.settings import check_foreign, foreign, settings_of_a_run
+from gridworld.config.settings import check_foreign, foreign, is_file, settings_of_a_run
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import is_override
 
@@ -35,7 +37,9 @@ _CHOICE = re.compile(r"\w[\w.-]*(/\w[\w.-]*)*")  # no way out of the folder of c
 # an override
 _WORD = re.compile(r"(?:(~)|(\+{0,2}))(\w+(?:\.\w+)*)(?(1)(?:=.*)?|=(.*))", re.ASCII | re.DOTALL)
 # text as it is
-_BARE = re.compile(r"(?!(?:true|false|null|nan|inf)$)[a-z_][\w.-]*", re.ASCII | re.IGNORECASE)
+_BARE = re.compile(
+    r"(?!(?:true|false|null|nan|inf)$)([a-z_]|/|\.\.?/)[\w./:-]*( [\w./:-]+)*", re.ASCII | re.IGNORECASE
+)
 _NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 
 
@@ -67,6 +71,8 @@ def _file(word: str) -> Path:
         raise InputError(f"{word}: no such file; must be a recipe's yaml, or the folder of a study")
     if not path.is_dir():
         return path
+    if not os.path.lexists(path / IN_A_STUDY[0]):
+        raise InputError(f"{word}: is not the folder of a study, it has no {'/'.join(IN_A_STUDY)}")
     if (path / IN_A_STUDY[0]).is_symlink():
         raise InputError(f"{path / IN_A_STUDY[0]}: is a symbolic link, which is not followed out of a study")
     return path.joinpath(*IN_A_STUDY)
@@ -142,29 +148,56 @@ def _values(content: dict[Any, Any], path: Path, section: str = "") -> Iterator[
             raise InputError(f"{path}: {name}={str(value)[:80]}: must be settings")
 
 
-def harmless_words(words: Sequence[str], config: TrainConfig) -> Iterator[str]:
-    """What a stranger's command line changed: choices, and settings with the values that `config` has.
+def words_again(
+    words: Sequence[str], config: TrainConfig, called_from: Path | None = None, trust: bool = False
+) -> Iterator[str]:
+    """What a command line changed, to be typed again here; the paths in it are relative to `called_from`.
 
-    What is not a setting, or would run code or read a file elsewhere, is left out.
+    Of a stranger's, these are choices, and settings with the values that `config` has. What is not a setting,
+    or would run code or read a file elsewhere, is left out unless there is `trust`.
     """
-    settings = dataclasses.asdict(config)
+    settings, changed = dataclasses.asdict(config), set[str]()
     for word in words:
         found = _WORD.fullmatch(word)
         if found is None:
+            yield from [word] if trust else []
             continue
         removed, sign, key, value = found.groups("")
-        place: Any = settings
+        given: Any = settings
         for name in key.split("."):
-            place = place.get(name, MISSING) if isinstance(place, dict) else MISSING
-        if key == KEY:
+            given = given.get(name, MISSING) if isinstance(given, dict) else MISSING
+        place = path_from_here(given, called_from) if _is_own_file(key, given) else given
+        changed.add(key)
+        if trust and place == given:
+            yield word
+        elif key == KEY:
             continue
-        if removed:
+        elif removed:
             yield f"~{key}"
         elif key in (*CHOSEN, IN_A_STUDY[0]):
             if _CHOICE.fullmatch(value):
                 yield f"{key}={value}"
-        elif place != MISSING and not any(foreign({key: place})):
+        elif place != MISSING and (trust or not any(foreign({key: place}))):
             yield f"{sign}{key}={literal(place, key)}"
+    for name, given in settings["env"].items() if trust else ():
+        key, place = f"env.{name}", path_from_here(given, called_from)  # of a yaml file
+        if _is_own_file(key, given) and key not in changed and place != given:
+            yield f"{key}={literal(place, key)}"
+
+
+def _is_own_file(key: str, value: Any) -> bool:
+    """Whether the value of a setting is a file's path, and not the name of a shipped map."""
+    from gridworld.world.layout import shipped_layouts  # here, with numpy
+
+    return is_file(key) and value not in shipped_layouts()
+
+
+def path_from_here(path: Any, called_from: Path | None) -> Any:
+    """The path of a file or folder that was typed in another folder, as it is typed here, if it is there."""
+    if called_from is None or not isinstance(path, str) or not os.path.exists(called_from / path):
+        return path
+    here, found = os.path.realpath(users_folder()), Path(os.path.normpath(called_from / path))
+    return str(found.relative_to(here) if found.is_relative_to(here) else found)
 
 
 def literal(value: Any, where: str) -> str:

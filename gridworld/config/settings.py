@@ -230,6 +230,11 @@ def _texts_at(name: str) -> frozenset[Text]:
     return _texts().get(name, frozenset([Text.CODE]))
 
 
+def is_file(name: str) -> bool:
+    """Whether a setting is the path of a file."""
+    return Text.FILE in _texts_at(name)
+
+
 @functools.cache
 def _texts() -> dict[str, frozenset[Text]]:
     found = settings_of_a_run().items()

@@ -173,10 +173,10 @@ class RecordingConfig:
     # how far the values are from the true ones
     q_error: bool = setting(True, {_PICTURE: Picture("q_error.png", "maps.q_error", "error of its values")})
     # where training has been
-    visits: bool = setting(True, {_PICTURE: Picture("visits.png", "maps.visits", "visits while it learnt")})
+    visits: bool = setting(True, {_PICTURE: Picture("visits.png", "maps.visits", "visits while it learned")})
     # the policy over training
     learning: bool = setting(
-        True, {_PICTURE: Picture("learning.gif", "maps.learning", "policy while it learnt")}
+        True, {_PICTURE: Picture("learning.gif", "maps.learning", "policy while it learned")}
     )
     # the final greedy policy's episode; MP4 needs the extra `video`
     frames: bool = setting(True, {_PICTURE: Picture("frames", "episode.episode")})

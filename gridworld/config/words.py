@@ -6,6 +6,7 @@ schema would refuse as well. `sentence` keeps the fact, and adds what would have
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import functools
 import itertools
@@ -17,6 +18,8 @@ from gridworld.base.bounds import digits
 from gridworld.base.errors import InputError, failure
 from gridworld.config.fields import MISSING
 from gridworld.config.settings import all_settings, settings_of_a_run, takes_whole_numbers
+from gridworld.config.train import AgentConfig
+from gridworld.config.worlds import EnvConfig
 
 OF_THE_COMMAND = ("experiment", "recipe", "resume", "trust", "anyway")  # words that look like settings
 _FLOAT = re.compile(r"(?<![\w.$'\"])[-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.'\"])")
@@ -46,8 +49,26 @@ _HINTS = (  # a pattern of what is said: what would have been right
         "; in YAML, write whole numbers without a decimal point or exponent",
     ),
     (r"Value '\d+(\.\.|-)\d+'", "; a range, for -m, is range(1,6)"),
+    (
+        r"'tune\.space.* not in struct|tune\.space=",
+        "; a search space is a yaml file in conf/tune, or in tune/ of --config-dir, chosen by tune=NAME",
+    ),
+    ("'SB3ClassConfig'", "; an argument of the class is written as +agent.arguments.gamma=0.9"),
+    ("'DimensionConfig'", "; a line of a search space is agent.gamma: {type: float, low: 0, high: 1}, say"),
+    ("'tune/.* in 'TuneConfig'", "; the first line of a search space is  # @package tune.space"),
 )
-_SYNTAX = ": is not valid syntax; is a comma, a bracket or a quotation mark missing or left over?"
+_REWRITTEN = (  # a pattern of what is said: what is put in its place
+    (r"Could not override '(agent\.[^']*)': Key '[^']*' not in '(\w+)Config'", r"\1: no such setting of \2"),
+    (r"Could not override '([^']*)': Key '[^']*' not in '\w+'", r"\1: no such setting"),
+    (r"Could not override '([^']*)': Key '([^']*)' is not in struct", r"\1: has no \2"),
+    (r"^In '([^']+)': \w+ raised while composing config: ", r"\1.yaml: "),
+    (r"Key '([^']*)' not in '\w+'", r"\1: no such key"),
+    (
+        r": (mismatched input|no viable alternative|extraneous input|token recog).*",
+        ": is not valid syntax; is a comma, a bracket or a quotation mark missing or left over?",
+    ),
+    (r"^LexerNoViableAltException: (.*)", r"\1: a quotation mark has no partner"),
+)
 _LISTED = 24  # choices of a group that are listed at most; of more, those with a similar name
 _PACKAGE = Path(__file__).parents[1]
 _WITH_VALUE = (  # Hydra's options that the next word belongs to
@@ -84,6 +105,8 @@ def prepared(words: Sequence[str], own: Sequence[Path] = ()) -> list[str]:
     chosen = {word.lstrip("+").partition("=")[0] for word in words if "=" in word}
     for word in words:
         key, _, value = word.partition("=")
+        if key[:1] == "~" and key[1:] in settings_of_a_run():
+            raise InputError(f"{word}: a setting cannot be taken away; give it a value, {key[1:]}=...")
         if key == "tuned" and "hydra.searchpath" not in chosen:
             _check_recipe(value, [conf_folder(), *own])
         if key.lstrip("+") == "experiment" and value in pairs():
@@ -152,7 +175,8 @@ def sentence(error: BaseException) -> str:
         return f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is not valid YAML: {problem}"
     if missing := re.search(r"[Mm]issing mandatory value: (\S+)", message):
         key = missing[1] if "." in missing[1] else getattr(error, "full_key", None) or missing[1]
-        return f"{key}: has no value; give {key}=..., or set it in a yaml file"
+        word = "" if key.startswith("tune.space.") else f"give {key}=..., or "
+        return f"{key}: has no value; {word}set it in a yaml file"
     for pattern, words in _SENTENCES:
         if found := re.search(pattern, message):
             return words.format(*found.groups())
@@ -166,12 +190,9 @@ def sentence(error: BaseException) -> str:
     if override and override not in facts[0]:
         facts.insert(0, override)
     text = ": ".join(fact.strip().rstrip(".:") for fact in facts)
-    text = re.sub(
-        r"Could not override '([^']*)': Key '[^']*' not in '(\w+)'", r"\1: no such setting in \2", text
-    )
-    text = re.sub(r": (mismatched input|no viable alternative|extraneous input|token recog).*", _SYNTAX, text)
-    text = re.sub(r"^LexerNoViableAltException: (.*)", r"\1: a quotation mark has no partner", text)
-    return text + _suggestion(" ".join(facts), message)
+    for pattern, words in _REWRITTEN:
+        text = re.sub(pattern, words, text)
+    return text + _suggestion(" ".join(facts), message, error)
 
 
 def unreadable_file(error: Exception, folders: Iterable[Path]) -> str:
@@ -199,11 +220,14 @@ def _unknown_choice(message: str) -> str:
     assert missing is not None
     choices = group.group(2).split() if group else []
     where, _, name = missing.group(1).rpartition("/")
+    if group and missing.group(1).startswith(f"{group.group(1)}/"):
+        where, name = group.group(1), missing.group(1)[len(group.group(1)) + 1 :]
     if where == "experiment":
         choices = sorted({*choices, *pairs()})
     fact = f"{where}={name}: no such choice"
     if where == "env" and re.search(r"-v\d+$", name):
-        return f"{fact}; for a Gymnasium environment, write env=gymnasium env.id={name}{meant(name, choices)}"
+        word = f"env=gymnasium env.id={_current_id(name)}"
+        return f"{fact}; for a Gymnasium environment, write {word}{meant(name, choices)}"
     if len(choices) <= _LISTED:
         return f"{fact}; choose from {', '.join(choices)}{meant(name, choices)}"
     near = [choice for choice in choices if choice.startswith(name)]
@@ -212,27 +236,51 @@ def _unknown_choice(message: str) -> str:
     return f"{fact}{hint}; --help lists them all"
 
 
-def _suggestion(facts: str, message: str) -> str:
+def _current_id(name: str) -> str:
+    """The id of the newest version of an environment of Gymnasium."""
+    from gymnasium.envs.registration import find_highest_version, get_env_id, parse_env_id
+
+    space, plain, _ = parse_env_id(name)
+    newest = find_highest_version(space, plain)
+    return name if newest is None else get_env_id(space, plain, newest)
+
+
+def _suggestion(facts: str, message: str, error: BaseException) -> str:
     for pattern, hint in _HINTS:
         if re.search(pattern, facts):
             return hint
     if added := re.search(r"Could not override '([^']*)'.*Key '([^']*)' is not in struct", facts, re.DOTALL):
         place, name = added.groups()
-        if place.startswith("tune.space"):
-            return "; the search space is a yaml file in conf/tune, chosen by tune=NAME"
         entry = place if place.endswith(f".{name}") else f"{place}.{name}"
         return f"; a new entry of a dictionary needs a plus: +{entry}=..."
     if unknown := re.search(r"Key '([^']*)' not in '\w+'", facts):
         if unknown[1] == "tune":
             return "; that is a setting of tune.py"
         place = re.search(r"full_key: (\S+)", message + facts) or re.search(r"override '([^']*)'", facts)
-        return _alike((place or unknown)[1], unknown[1])
+        return _alike((place or unknown)[1], unknown[1], _not_chosen(error))
     return ""
 
 
-def _alike(name: str, key: str) -> str:
+def _not_chosen(error: BaseException) -> set[str]:
+    """The settings of other agents and worlds than those in which OmegaConf found an error."""
+    from omegaconf import DictConfig, OmegaConf  # here, since --help takes no longer than it must
+
+    found = (getattr(each, "parent_node", None) for each in (error, error.__cause__))
+    nodes = [each for each in found if isinstance(each, DictConfig)]
+    others = set[str]()
+    for section, schema in (("agent", AgentConfig), ("env", EnvConfig)):
+        for node in (*nodes, *(node[section] for node in nodes if section in node)):
+            kind = OmegaConf.get_type(node)
+            if isinstance(kind, type) and issubclass(kind, schema):
+                own = {field.name for field in dataclasses.fields(kind)}
+                places = (name.split(".") for name in all_settings())
+                others |= {".".join(name) for name in places if name[0] == section and name[1] not in own}
+    return others
+
+
+def _alike(name: str, key: str, others: set[str]) -> str:
     """The settings in the section of `name` that look like `key`, or else those in other sections."""
-    known = {*all_settings(), *OF_THE_COMMAND} - {name}
+    known = {*all_settings(), *OF_THE_COMMAND} - {name} - others
     section = name.rpartition(".")[0]
     own = [each[len(section) + bool(section) :] for each in known if each.startswith(section)]
     if near := meant(key, sorted({each.partition(".")[0] for each in own} - {key})):

@@ -77,7 +77,7 @@ class Evidence:
     """A run, as its files and its agent have it; what takes time to compute is computed when asked for."""
 
     config: TrainConfig
-    overrides: Sequence[str]  # the words of its command line
+    overrides: Sequence[str] | None  # the words of its command line; None: not all can be given again
     curve: Mapping[str, NDArray[Any]]  # (evaluations,) each, the columns of `curve.csv`
     visits: NDArray[np.int64]  # (S, A), how often training took each action in each state
     evaluator: Evaluator  # of its world
@@ -89,7 +89,8 @@ class Evidence:
         """Read a run's files."""
         agent, visits = saved.agent(), read_visits(saved.run, saved.mdp.next_state.shape[:2])
         curve, evaluator = read_columns(saved.run), saved.evaluator()
-        return cls(saved.config, saved.overrides, curve, visits, evaluator, agent, agent.snapshot())
+        words = None if saved.omission else saved.overrides
+        return cls(saved.config, words, curve, visits, evaluator, agent, agent.snapshot())
 
     def __post_init__(self) -> None:
         self.mdp, snapshot = self.evaluator.mdp, self.snapshot

@@ -122,6 +122,8 @@ def diagnose(run: Evidence) -> Diagnosis:
 
 def _offers(run: Evidence, findings: tuple[Finding, ...]) -> tuple[tuple[str, ...], ...]:
     """The run's own words with a change each: those of the first cause, then one of each other."""
+    if run.overrides is None:
+        return ()
     first, others = findings[0].changes, [word for each in findings[1:] for word in each.changes[:1]]
     changes = list(dict.fromkeys((*first, *others)))[:_MOST_CHANGES]
     key, fits = run.config.agent.key("gamma"), score_of_optimum(run.evaluator, run.own.gamma).certified
@@ -171,6 +173,8 @@ def trials_folder(folder: Path) -> Path:
 
 def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool, offer: TrainConfig | None = None) -> None:
     """Check that to compose and train the offers, or this one, runs no code of a stranger's choice."""
+    if saved.omission:
+        raise InputError(saved.omission)
     if found.offers and not trust:
         config = saved.config if offer is None else offer
         built = {"agent": dataclasses.asdict(config.agent), "callbacks": config.callbacks}

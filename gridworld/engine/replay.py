@@ -36,7 +36,7 @@ class UniformReplay:
 
     @cached_property
     def _columns(self) -> dict[str, NDArray[Any]]:
-        """Made when something is stored: who is only asked what it learnt needs no memory for it."""
+        """Made when something is stored: who is only asked what it learned needs no memory for it."""
         shape = self._shape
         return {
             "states": np.zeros(shape, self._state),

@@ -25,7 +25,8 @@ class Estimate:
     high: float
 
     def __str__(self) -> str:
-        return f"{self.mean:.4g} [{self.low:.3g}, {self.high:.3g}]"
+        low, high = (f"{end:.{4 if abs(end) > 999 else 3}g}" for end in (self.low, self.high))
+        return f"{self.mean:.4g} [{low}, {high}]"
 
 
 def wilson_interval(count: int, total: int) -> tuple[float, float]:

@@ -85,7 +85,7 @@ def _curves(analysis: TaskAnalysis, styles: Styles, more: str) -> Iterator[Chart
         )
     bands = {result.group.agent: result.online for result in results if result.online is not None}
     if any(band.point.any() for band in bands.values()):
-        # The first tenth, where most is learnt, would flatten all the rest.
+        # The first tenth, where most is learned, would flatten all the rest.
         late = np.concatenate([band.point[len(band.point) // 10 :] for band in bands.values()])
         yield draw(
             f"{task} online_return",

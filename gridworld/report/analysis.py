@@ -15,6 +15,7 @@ import numpy as np
 from gridworld.base.errors import InputError
 from gridworld.config.train import check_bounds
 from gridworld.config.worlds import schema_of
+from gridworld.playground.page import fits, link
 from gridworld.report import statistics
 from gridworld.report.evidence import (
     DAMAGED,
@@ -32,6 +33,7 @@ from gridworld.report.tuning_study import TuningStudy, find_tunings
 from gridworld.run.provenance import versions
 from gridworld.run.reader import read_run, stored_world
 from gridworld.world.evaluation import Evaluator
+from gridworld.world.grid import GridMdp
 from gridworld.world.mdp import FloatArray
 
 MOST_SHOWN = 20  # sentences on standard error; the page has them all
@@ -52,6 +54,7 @@ class Reference:
     random_value: float = math.nan
     random_return: float = math.nan
     problem: str | None = None  # why they are missing, or in doubt
+    link: str | None = None  # to its map in the playground, what follows the page's address
 
 
 def _reference(run: Evidence) -> Reference:
@@ -78,7 +81,9 @@ def _reference(run: Evidence) -> Reference:
             f"{run.folder}; was it written by another version?"
         )
     returns = evaluator.optimum.expected_return, random.outcome.expected_return
-    return Reference(run.optimal_value, returns[0], random.value, returns[1], problem)
+    limit = env.step_limit(mdp)
+    address = link(mdp, run.gamma, limit) if isinstance(mdp, GridMdp) and fits(mdp) else None
+    return Reference(run.optimal_value, returns[0], random.value, returns[1], problem, address)
 
 
 @dataclass(frozen=True)
@@ -326,8 +331,8 @@ def _task(task: str, groups: list[Group], seed: int, log_steps: bool) -> TaskAna
     runs = [run for group in groups for run in group.runs]
     world = _reference(next((run for run in runs if not run.damage), runs[0]))
     ends = [max(run.steps for run in group.runs) for group in groups]
-    learnt = [float(np.median([run.first_certified_step for run in group.runs])) for group in groups]
-    for steps in (ends, learnt):  # whether one agent ran, or learnt, ten times as long as another
+    learned = [float(np.median([run.first_certified_step for run in group.runs])) for group in groups]
+    for steps in (ends, learned):  # whether one agent ran, or learned, ten times as long as another
         known = [step for step in steps if 0 < step < math.inf]
         log_steps |= bool(known) and max(known) >= _SLOWER * min(known)
     grid = _grid(runs, log_steps)

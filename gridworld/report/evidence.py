@@ -22,7 +22,7 @@ from gridworld.base.errors import InputError
 from gridworld.base.safe_read import LARGEST_CSV, as_table
 from gridworld.config.settings import NEWER, flat, privileges
 from gridworld.run.folder import CURVE, MANIFEST, SUMMARY, VISITS
-from gridworld.run.reader import RunReader, read_run
+from gridworld.run.reader import RunReader, check_is_folder, read_run
 from gridworld.world.mdp import FloatArray
 from gridworld.world.metrics import METRICS
 
@@ -105,9 +105,10 @@ def find_runs(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     folders: dict[Path, Path] = {}  # by what they really are
     problems: list[str] = []
     for path in dict.fromkeys(paths):
-        if not path.is_dir():
-            what = "is a file" if path.exists() else "no such folder"
-            problems.append(f"{path}: {what}; give the folder of a run, of a sweep, or one above them")
+        try:
+            check_is_folder(path, "a run, of a sweep, or one above them")
+        except InputError as error:
+            problems.append(str(error))
             continue
         found = sorted(_search(path, problems))
         for folder in found:

@@ -1,7 +1,7 @@
 """A report's folder: one HTML page without scripts or network, figures and tables as files, event files.
 
-The folder is written whole or not at all. The event files have the curves over seeds, since TensorBoard
-cannot average runs.
+The page links to that of the playground, which lies beside it and has scripts. The folder is written whole or
+not at all. The event files have the curves over seeds, since TensorBoard cannot average runs.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from gridworld.base.console import plain, tell
 from gridworld.base.errors import InputError, reason
 from gridworld.base.safe_read import read_bytes, sha256
 from gridworld.config.train import PICTURES
+from gridworld.playground.page import maps_page
 from gridworld.report import statistics, tables
 from gridworld.report.analysis import MOST_SHOWN, Band, Report, Result, TaskAnalysis, gather
 from gridworld.report.tables import to_captioned_markdown, to_csv, to_markdown
@@ -39,7 +40,7 @@ if TYPE_CHECKING:  # a sweep does not wait for matplotlib and Jinja
 
     from gridworld.report.chart import Chart, Styles
 
-PAGE = "report.html"
+PAGE, PLAYGROUND = "report.html", "playground.html"
 FIGURES, TABLES, EVENTS = "figures", "tables", "tensorboard"
 OVER_SEEDS = "_over_seeds"  # in a sweep's folder or a study's; TensorBoard shows it before the runs
 FORMATS = ("png", "pdf", "svg")  # of the figures
@@ -54,7 +55,7 @@ MARKERS = "<!-- results -->", "<!-- /results -->"
 
 _ALL_TASKS = ""  # no task's name
 _MOST_READ_UNASKED = 500  # runs of a sweep: a second
-_OURS = {PAGE, FIGURES, TABLES, EVENTS}
+_OURS = {PAGE, PLAYGROUND, FIGURES, TABLES, EVENTS}
 _LONGEST_NAME = 120
 _LARGEST = {".png": 4 * 2**20, ".gif": 256 * 2**10}  # bytes
 _MOST_PIXELS = 4_000_000
@@ -86,6 +87,8 @@ def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS)
     drawn = [chart for of_one in of_all.values() for chart in of_one]
     with replacing_folder(folder) as new:
         write_text(new / PAGE, render(report, of_all))
+        if any(task.world.link for task in report.tasks):
+            write_text(new / PLAYGROUND, maps_page())
         (new / FIGURES).mkdir()
         for name, chart in zip(_file_names(chart.name for chart in drawn), drawn, strict=True):
             for kind in formats:

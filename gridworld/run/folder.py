@@ -9,7 +9,7 @@
     evaluations.npz the learning curve's exact returns and lengths, as SB3's EvalCallback writes sampled ones
     world.npz       the world's tables, where it is not a map (`gridworld.world.sources.arrays`)
     visits.npy      how often training took each action in each state, (S, A)
-    policy.png, q_error.png, visits.png, learning.gif   what was learnt, how well, where, and how
+    policy.png, q_error.png, visits.png, learning.gif   what was learned, how well, where, and how
     frames/, episode.gif, ...   the final policy's episode
     train.log       when it began and ended, and what was warned about
     error.txt       the traceback, where a bug ended it
@@ -90,7 +90,8 @@ class RunFolder:
         """The command line that resumes the run; for settings that the user has `trusted`, it says so."""
         parts = {key: (trusted or {}).get(key) for key in ("agent", "callbacks")}  # that are built again
         trust = " trust=true" if any(foreign(parts)) else ""
-        return f"{command('train')} resume={shell_path(self.folder)}{trust}"
+        place = Path(os.path.normpath(users_folder() / self.folder))  # `resume` refuses ../runs/mine
+        return f"{command('train')} resume={shell_path(place)}{trust}"
 
 
 def shown(folder: Path) -> str:

@@ -44,6 +44,10 @@ _VARIABLES = (
 _GIT_SECONDS = 10
 _PACKAGE = Path(__file__).parents[1]
 _PARTS = ("gridworld", "conf", "scripts", "pyproject.toml")  # of the source tree: what the numbers depend on
+_PLUGINS = (
+    "checking/pytest_plugin.py",
+    "sweeps/hydra_plugin.py",
+)  # elsewhere in a wheel; no number depends on them
 _FIXED = frozenset(Effect) - {Effect.LENGTH, Effect.NOTHING}
 _FOR_ALL_AGENTS = ("python", "gridworld", "gymnasium", "numpy", "scipy")
 
@@ -100,8 +104,7 @@ def versions() -> dict[str, str | None]:
 def code() -> str:
     """A hash of the package's source files, SHA-256 as hexadecimal digits."""
     found = hashlib.sha256()
-    elsewhere = _PACKAGE / "sweeps" / "hydra_plugin.py"  # in a wheel; no number depends on it
-    for path in sorted({*_PACKAGE.rglob("*.py")} - {elsewhere}):
+    for path in sorted({*_PACKAGE.rglob("*.py")} - {_PACKAGE / plugin for plugin in _PLUGINS}):
         found.update(f"{path.relative_to(_PACKAGE).as_posix()} {sha256(path.read_bytes())}\n".encode())
     return found.hexdigest()
 

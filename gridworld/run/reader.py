@@ -40,6 +40,7 @@ LARGEST_RESULT = 2**30  # bytes of a file
 # Runs that were updated at once, this one among them, so that the numbers of each depend on all: a hash of
 # the settings of each (`provenance.settings_hash`) by its folder's name, in their order.
 NUMBERS_DEPEND_ON = "numbers_depend_on"
+_KINDS = {MANIFEST: "run", SWEEP_JSON: "sweep"}  # of folders
 
 
 class RunReader(RunFolder):
@@ -118,15 +119,14 @@ def open_run(folder: Path) -> RunReader:
     """Read a finished run."""
     run = read_run(folder)
     if not run.is_finished:
-        raise InputError(
-            f"{folder}: this run is {run.manifest['status']!r}; only finished runs can be opened"
-        )
+        what = f"this run is {run.manifest['status']!r}, not finished; resume it with  {run.resume_command()}"
+        raise InputError(f"{folder}: {what}")
     return run
 
 
 def read_run(folder: Path) -> RunReader:
     """Read a run, finished or not."""
-    check_is_run(folder)
+    check_is(folder)
     return RunReader(folder, _read_manifest(folder / MANIFEST))
 
 
@@ -149,19 +149,23 @@ def is_started(folder: Path) -> bool:
     return not is_empty or any(path.exists() and path.stat().st_size for path in results)
 
 
-def check_is_run(folder: Path) -> None:
-    """Check that a folder has a manifest, whatever is in it."""
-    if not folder.exists():
-        key, _, value = str(folder).partition("=")
-        is_there = bool(value) and Path(value).is_dir()
-        wanted = f"leave out {key}=" if is_there else "give the folder of a run, e.g. one in runs/"
-        raise InputError(f"{folder}: no such folder; {wanted}")
-    if not os.path.lexists(folder / MANIFEST):
-        what = f"not a run's folder, it has no {MANIFEST}"
-        if (folder / SWEEP_JSON).exists():
-            what = "is a sweep's folder, not a run's"
-        runs = sorted(path.parent for path in folder.glob(f"*/{MANIFEST}"))
-        raise InputError(f"{folder}: {what}" + (f"; give one of its runs, e.g. {runs[0]}" if runs else ""))
+def check_is_folder(path: Path, of: str) -> None:
+    """Check that there is a folder; it is to be that `of` something."""
+    if not path.is_dir():
+        key, _, value = str(path).partition("=")
+        wanted = f"leave out {key}=" if value and Path(value).is_dir() else f"give the folder of {of}"
+        raise InputError(f"{path}: {'is a file' if path.exists() else 'no such folder'}; {wanted}")
+
+
+def check_is(folder: Path, file: str = MANIFEST) -> None:
+    """Check that a folder is a run's, or of the file `SWEEP_JSON` a sweep's, whatever is in it."""
+    kind = _KINDS[file]
+    check_is_folder(folder, f"a {kind}")
+    if not os.path.lexists(folder / file):
+        others = [f"is a {kind}'s folder, not" for each, kind in _KINDS.items() if (folder / each).exists()]
+        what = f"{others[0]} a {kind}'s" if others else f"not a {kind}'s folder, it has no {file}"
+        found = sorted(path.parent for path in folder.glob(f"*/{file}"))
+        raise InputError(f"{folder}: {what}" + (f"; give a {kind}'s, e.g. {found[0]}" if found else ""))
 
 
 def check_free(folder: Path, key: str = "hydra.run.dir") -> None:
@@ -242,7 +246,9 @@ _ENTRIES: dict[str, tuple[Any, str]] = {
     "started": (str, "a date"),
     "ended": (str | None, "a date"),
     "error": (str, "a sentence"),
-    "overrides": ([str], "the words of a command line"),
+    "command": ([str], "the words of a command line"),
+    "overrides": ([str], "words of a command line"),
+    "called_from": (str, "a path from the run's folder"),
     "sha256": ({}, "a checksum for each file"),
     "resumed": (
         [_RESUMPTION],

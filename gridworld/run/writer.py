@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import warnings
 from collections.abc import Mapping
 from contextvars import ContextVar
@@ -20,7 +21,7 @@ from gridworld.base.console import TOLD, plain, recorded_command_line
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import check_no_link, file_sha256, sealed
 from gridworld.base.together import mixed
-from gridworld.base.user_input import npz_bytes
+from gridworld.base.user_input import npz_bytes, users_folder
 from gridworld.run import provenance
 from gridworld.run.folder import CHECKED, CHECKPOINTS, OUTPUTS, RunFolder
 from gridworld.run.provenance import describe, source_differences
@@ -55,6 +56,7 @@ class RunWriter(RunFolder):
             "ended": None,
             "command": recorded_command_line(),
             "overrides": overrides,
+            "called_from": os.path.relpath(os.path.realpath(users_folder()), os.path.realpath(folder)),
             "seed": config["seed"],
             "threads": config["threads"],
             **_mixed_runs(),

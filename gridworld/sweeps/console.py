@@ -19,6 +19,7 @@ from typing import Any
 from gridworld.base.console import aligned, command, command_line, duration, printable
 from gridworld.base.errors import InputError
 from gridworld.config.fields import Effect
+from gridworld.config.recipe_file import literal
 from gridworld.config.settings import ON_RESULT, effect_of, flat, with_effects
 from gridworld.envs.rollout import wilson_interval
 from gridworld.run.folder import shell_path
@@ -81,7 +82,7 @@ def resume_command(folder: Path, *more: str) -> str:
     """This command line with `more` words, and with the folder if it does not name it."""
     words = command_line()
     if not any(word.startswith("hydra.sweep.dir=") for word in words):
-        more = (f"hydra.sweep.dir={folder}", *more)
+        more = (f"hydra.sweep.dir={literal(str(folder), 'hydra.sweep.dir')}", *more)
     return printable(shlex.join([*words, *(word for word in more if word not in words)]))
 
 

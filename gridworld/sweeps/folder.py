@@ -30,9 +30,17 @@ from gridworld.base.atomic_write import (
 from gridworld.base.console import recorded_command_line
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import LARGEST_JSON, csv_text, read_bytes, read_sealed, sealed
-from gridworld.run.folder import ERROR_FILE, HYDRA, LOCK, MANIFEST, SWEEP_JSON, alone_in, check_writable
+from gridworld.run.folder import (
+    ERROR_FILE,
+    HYDRA,
+    LOCK,
+    MANIFEST,
+    SWEEP_JSON,
+    alone_in,
+    check_writable,
+)
 from gridworld.run.provenance import settings_hash, versions
-from gridworld.run.reader import RunReader, find_run
+from gridworld.run.reader import RunReader, check_is, find_run
 from gridworld.sweeps.plan import Job
 
 JOBS_CSV = "jobs.csv"
@@ -175,9 +183,7 @@ class SweepFolder:
 
 def open_sweep(path: Path) -> SweepFolder:
     """A sweep's folder, for reading. Raises `InputError` where there is none, or sweep.json is damaged."""
-    if not os.path.lexists(path / SWEEP_JSON):
-        reason = f"not a sweep's folder, it has no {SWEEP_JSON}" if path.exists() else "no such folder"
-        raise InputError(f"{path}: {reason}; give the folder of a sweep, e.g. one in runs/")
+    check_is(path, SWEEP_JSON)
     return SweepFolder(path)
 
 

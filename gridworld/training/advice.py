@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import shlex
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from gridworld.base.console import aligned, command
 from gridworld.base.errors import InputError
 from gridworld.config.presets import fitting_preset, is_world
 from gridworld.config.train import AUTO, TrainConfig
-from gridworld.config.words import conf_folder, own_conf_folders
+from gridworld.config.words import conf_folder
 from gridworld.run.folder import SWEEP_JSON, RunFolder, shell_path
 from gridworld.run.reader import LARGEST_RESULT, RunReader
 from gridworld.training.saved_run import SavedRun
@@ -26,18 +26,24 @@ _WHY = "why it is not optimal:"
 _REPLACED = ("total_timesteps", "n_envs", "preset", "tuned")
 
 
-def advice(folder: Path) -> list[str]:
-    """Lines to print below the verdict on a finished run that is not certified."""
+def advice(folder: Path, trust: bool = False) -> list[str]:
+    """Lines to print below the verdict on a finished run that is not certified; `trust` as for `SavedRun`."""
     if not RunFolder(folder).manifest_file.exists():
         return []
     place = shell_path(folder)
     try:
-        rows = list(_commands(SavedRun(folder), place))
-    except InputError:  # it has a custom class, which is imported with trust only
-        rows = [[_WHY, f"{command('diagnose')} {place} --trust"]]
+        rows = list(_commands(SavedRun(folder, trust), f"{place}{_trust(folder)}"))
     except (OSError, ValueError):  # the run was just made, but anybody may have touched it since
         return []
     return ["try:", *(f"  {line}" for line in aligned(rows, ("<0", "<0")))]
+
+
+def _trust(folder: Path) -> str:
+    """The option without which `diagnose` would not open the run, or leave out words of its command line."""
+    with contextlib.suppress(InputError):
+        saved = SavedRun(folder)
+        return " --trust" if saved.overrides and saved.omission else ""
+    return " --trust"
 
 
 def _commands(saved: SavedRun, place: str) -> Iterator[list[str]]:
@@ -57,8 +63,7 @@ def _commands(saved: SavedRun, place: str) -> Iterator[list[str]]:
 
 
 def _train(words: Sequence[str]) -> str:
-    folders = [f"--config-dir={folder}" for folder in own_conf_folders(sys.argv[1:])]
-    return f"{command('train')} {shlex.join([*folders, *words])}"
+    return f"{command('train')} {shlex.join(words)}"
 
 
 def _key(word: str) -> str:

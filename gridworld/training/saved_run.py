@@ -11,17 +11,19 @@ from __future__ import annotations
 import dataclasses
 import io
 import math
+import os
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot
-from gridworld.base.console import tell
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import DAMAGED, limited
 from gridworld.config.settings import check_foreign, read_config
 from gridworld.config.train import TrainConfig, check
+from gridworld.config.words import own_conf_folders
 from gridworld.config.worlds import MapConfig
 from gridworld.run.folder import shown
 from gridworld.run.reader import RunReader, open_run, stored_world
@@ -54,21 +56,34 @@ class SavedRun:
 
     @property
     def overrides(self) -> list[str]:
-        """The words of its command line, as they may be given again.
+        """The words of its command line, as they may be given again from here, with its `--config-dir`.
 
-        Of a run that is not trusted they are made of its settings, and what would run code is left out.
+        Of a run that is not trusted they are made of its settings, and what may run code is left out.
         """
-        # here, with Hydra, which takes its time
-        from gridworld.config.recipe_file import harmless_words
+        return self._words[0]
 
-        words: list[str] = self.run.manifest.get("overrides") or []
-        kept = list(words) if self._trust else list(harmless_words(words, self.config))
-        if left_out := len(words) - len(kept):
-            tell(
-                f"{shown(self.run.folder)}: {left_out} of the {len(words)} words of its command line may "
-                "run code or leave its folder, and are omitted; open the run with trust to keep them"
-            )
-        return kept
+    @property
+    def omission(self) -> str:
+        """A sentence on what `overrides` leaves out; "" for nothing."""
+        what = f"{shown(self.run.folder)}: its command line may run code or read files outside this folder; "
+        return f"{what}diagnose it with --trust (trust=True) to see what to try" if self._words[1] else ""
+
+    @cached_property
+    def _words(self) -> tuple[list[str], bool]:
+        """The `overrides`, and whether any are left out."""
+        # here, with Hydra, which takes its time
+        from gridworld.config.recipe_file import path_from_here, words_again
+
+        manifest, trust = self.run.manifest, self._trust
+        place = manifest.get("called_from")
+        called_from = None if place is None else Path(os.path.realpath(self.run.folder), place)
+        line, given = manifest.get("command", []), manifest.get("overrides") or []
+        words = [word for word in given if not word.startswith("--")]
+        words += [word for word in line if word.startswith("hydra.searchpath=") and word not in given]
+        folders = dict.fromkeys(own_conf_folders([*line, *given]))
+        own = [f"--config-dir={path_from_here(str(each), called_from)}" for each in folders if trust]
+        kept = [*own, *words_again(words, self.config, called_from, trust)]
+        return kept, not trust and len(kept) < len(words) + len(folders)
 
     @limited()
     def evaluator(self, layout: str | None = None) -> Evaluator:
@@ -103,7 +118,7 @@ class SavedRun:
         return agent
 
     def steps(self) -> int:
-        """The environment steps that the agent has learnt for."""
+        """The environment steps that the agent has learned for."""
         steps = self.run.read_summary().get(self._steps)
         if not isinstance(steps, int) or isinstance(steps, bool) or steps < 0:
             raise InputError(

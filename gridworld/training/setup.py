@@ -125,5 +125,5 @@ def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:
     key, right = config.agent.key("gamma"), fitting_discounts(judge)[0]
     return (
         f"{key.lstrip('+')}={gamma:g}: its optimum has a regret of {score.regret:.2g} under "
-        f"evaluation.gamma={judged:g}, too much for a certificate; take {key}={right:g}"
+        f"evaluation.gamma={judged:g}, too much for a certificate; use {key}={right:g}"
     )

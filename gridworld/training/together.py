@@ -1,7 +1,7 @@
 """Several trainings in one thread, of which those of one kind learn as one population.
 
 A training is a generator: it prepares a run, yields one `Learning`, and when that has ended it writes what
-was learnt and returns its result. So one training can run alone, or several can be prepared, learn at once,
+was learned and returns its result. So one training can run alone, or several can be prepared, learn at once,
 and end one after the other, and none can tell the difference. Each runs in a context of its own.
 """
 
@@ -97,6 +97,6 @@ class _Run(Generic[T]):
             )
 
     def end(self, stop: BaseException) -> None:
-        """Raise what it learnt with, or `stop`, in it; nothing happens if it has not begun or has ended."""
+        """Raise what it learned with, or `stop`, in it; nothing happens if it has not begun or has ended."""
         with contextlib.suppress(BaseException):  # it may raise another one on its way out
             self._context.run(self._training.throw, self.error or stop)

@@ -94,7 +94,7 @@ class Subject:
     evaluator: Evaluator
     snapshot: PolicySnapshot
     steps: int  # environment steps that it was trained for
-    visits: NDArray[np.int64] | None  # (S, A), how often it acted so while it learnt; None: not known
+    visits: NDArray[np.int64] | None  # (S, A), how often it acted so while it learned; None: not known
     history: PolicyHistory | None = None  # the policy over training, where it was kept
 
 

@@ -216,6 +216,8 @@ class Chain:
             among = coo_array(self.transition[endless][:, endless])
             _, label = connected_components(among, directed=True, connection="strong")
             leaving = label[among.row][label[among.row] != label[among.col]]
+            to_rest = self.transition[endless][:, np.flatnonzero(self.mdp.absorbing)].sum(axis=1) > 0
+            leaving = np.concatenate([leaving, label[to_rest]])
             recurrent[endless] = np.where(np.isin(label, leaving), 0, label + 1)
         return recurrent
 
@@ -283,6 +285,41 @@ def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
         raise InputError(f"policy: row {state} is {table[state].tolist()}, not a probability distribution")
     normalised: FloatArray = table / total
     return normalised
+
+
+def as_numbers(name: str, table: Any, others: str) -> FloatArray:
+    """A table as float64; refuses anything else. Messages call it `name`, and say what `others` it may be."""
+    try:
+        if table is None:  # which numpy takes for NaN
+            raise TypeError
+        return np.asarray(table, dtype=np.float64)
+    except (TypeError, ValueError, RuntimeError):  # torch's, for a tensor with a gradient
+        kind = type(table).__name__
+        raise InputError(f"{name}: {kind} is neither {others} nor a table of numbers") from None
+
+
+def policy_of_table(mdp: Mdp, name: str, numbers: FloatArray, is_q: bool = False) -> FloatArray:
+    """Actions (S,), probabilities (S, A) or Q values (S, A) as a policy (S, A); refuses anything else."""
+    size = mdp.num_states
+    if numbers.shape == (size,) and not is_q:
+        wrong = ~np.isin(numbers, np.arange(mdp.num_actions))
+        if wrong.any():
+            state = int(np.argmax(wrong))
+            raise InputError(
+                f"{name}: state {state} has the action {numbers[state]:g}; must be {mdp.action_choices()}"
+            )
+        return one_hot_policy(numbers.astype(np.int64), mdp.num_actions)
+    if numbers.shape != (size, mdp.num_actions):
+        either = "" if is_q else f"({size},) actions or "
+        raise InputError(
+            f"{name}: has shape {numbers.shape}; {mdp.name} has {size} states and "
+            f"{mdp.num_actions} actions, so it must be {either}({size}, {mdp.num_actions})"
+        )
+    if is_q:
+        return one_hot_policy(numbers.argmax(axis=1), mdp.num_actions)
+    if (numbers < 0).any() or (np.abs(numbers.sum(axis=1) - 1) > 1e-4).any():
+        raise InputError(f"{name}: its rows are not probability distributions; give Q values as q=...")
+    return numbers
 
 
 def can_reach(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> BoolArray:

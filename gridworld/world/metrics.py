@@ -51,7 +51,7 @@ class EpisodeReturns(Protocol):
 
 @dataclass(frozen=True)
 class TrainingMetric:
-    """A number of training itself, exploration and half-learnt policies included."""
+    """A number of training itself, exploration and half-learned policies included."""
 
     name: str  # the column
     tag: str

@@ -1,7 +1,6 @@
 """A score is of what was given: wrappers, every copy of a batch, what `predict` does. Truth is by playing."""
 
 import functools
-import time
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -195,13 +194,16 @@ def agrees(score: gridworld.Score, mean: float, error: float) -> bool:
 
 @pytest.mark.parametrize(
     ("world", "kind"),
-    [(w, k) for w in WORLDS for k in (list(COMPILED)[:5] if w == "taxi" else [*NEUTRAL, *COMPILED])],
+    [
+        *((w, k) for w in WORLDS for k in (list(COMPILED)[:5] if w == "taxi" else COMPILED)),
+        *((w, k) for w in ("lake", "slippery grid") for k in NEUTRAL),
+    ],
 )
 def test_the_score_of_a_table_is_what_it_earns_through_wrappers(world: str, kind: str) -> None:
     env = {**NEUTRAL, **COMPILED}[kind](WORLDS[world]())
     states, actions = env.unwrapped.observation_space.n, env.action_space.n
     rng, episodes = np.random.default_rng(3), {"slippery grid": 200, "taxi": 40}.get(world, 1)
-    for _ in range(1 + (world != "taxi")):
+    for _ in range(2 if episodes == 1 else 1):
         table = rng.integers(actions, size=states)
         score = gridworld.evaluate(table, env)
         mean, error = played(env, lambda _, table=table: int(table[state_of(env)]), episodes)
@@ -213,7 +215,7 @@ def test_the_score_of_a_table_is_what_it_earns_through_wrappers(world: str, kind
 
 
 @pytest.mark.parametrize("kind", UNKNOWN)
-@pytest.mark.parametrize("world", ["lake", "grid", "cliff"])
+@pytest.mark.parametrize("world", ["lake", "grid"])
 def test_an_unknown_wrapper_is_refused_alone_and_in_every_batch(world: str, kind: str) -> None:
     make = WORLDS[world]
     table = np.ones(make().unwrapped.observation_space.n, dtype=int)
@@ -341,11 +343,6 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {  # what makes an environme
     "a batch that pays": (lambda: wrappers.vector.TransformReward(native(), lambda r: -r), _BATCH),
     "a batch that scales": (lambda: wrappers.vector.NormalizeReward(SyncVectorEnv([lake])), _BATCH),
     "a batch that shows otherwise": (lambda: Saving([lake]), _ENV),
-    "what a Monitor has counted":
-        (lambda: paying(lambda self, r: r + self.env.total_steps)(Monitor(lake())), "below it .total_steps"),
-    "the state, where it can be read":
-        (lambda: paying(lambda self, r: getattr(self.unwrapped, "state", r))(lake()), "below it .unwrapped"),
-    "a clock": (lambda: paid_by(lambda r: r + (time.monotonic() < 0))(lake()), "refers to time.monotonic"),
     "a step by another way": (lambda: Elusive(lake()), _STEP),
     "an environment by another way": (lambda: Indirect(lake()), _STEP),
     "a grid that is asked by another way":
@@ -467,6 +464,7 @@ SEEN: dict[str, Callable[[], Any]] = {
         VecNormalize(VecExtractDictObs(DummyVecEnv([as_dict] * 2), "place"))
     ),
     "grid coordinates": lambda: gridworld.CoordinateObservation(grid()),
+    "grid images": lambda: gridworld.ImageObservation(grid(), cell_size=9),
     "our batch": lambda: VecCheckNan(gridworld.make_vec_env(layout="frozen_lake_4x4", n_envs=3)),
 }
 
@@ -486,11 +484,15 @@ def played_by(model: Any, env: Any) -> float:
 @pytest.mark.parametrize("kind", SEEN)
 def test_a_model_is_scored_by_what_it_is_shown(kind: str) -> None:
     env = SEEN[kind]()
-    for seed in range(4):
+    for seed in range(2):
         model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=seed, device="cpu")
         score = gridworld.evaluate(model, env)
         assert score == gridworld.evaluate(model, model.get_env()) == gridworld.evaluate(model)
         assert score.outcome.expected_return == pytest.approx(played_by(model, env), abs=1e-6)
+        for training in (True, False):  # is left as it was
+            model.policy.set_training_mode(training)
+            gridworld.evaluate(model)
+            assert model.policy.training is training
 
 
 def test_a_model_behind_turned_actions_is_certified_for_what_it_earns() -> None:

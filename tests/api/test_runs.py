@@ -12,7 +12,7 @@ import hydra
 import numpy as np
 import pytest
 import torch
-from helpers.support import CONF, SHORT, configure, script
+from helpers.support import CONF, NO_FILES, SHORT, configure, script
 from hydra.core.global_hydra import GlobalHydra
 from hydra.version import getbase
 from omegaconf import OmegaConf
@@ -23,12 +23,6 @@ from gridworld import InputError
 from gridworld.training.session import Session
 
 TIMES = ("train_seconds", "evaluation_seconds")
-SMALL = (
-    "total_timesteps=300",
-    "agent.learning_starts=100",
-    "n_envs=10",
-    "agent.policy_kwargs.net_arch=[512,512]",
-)
 
 
 def timeless(summary: dict[str, object]) -> dict[str, object]:
@@ -102,7 +96,7 @@ def test_what_a_result_has() -> None:
     assert run.model.num_timesteps == run.summary["timesteps"]
     assert repr(run) == f"RunResult(dqn on classic, seed 1: {run.summary['timesteps']:,} steps, regret 0.932)"
     before = run.policy.q.copy()
-    run.model.learn(3000)  # an ordinary model, which goes on learning
+    run.model.learn(600)  # an ordinary model, which goes on learning
     assert np.array_equal(run.policy.q, before)
     table = gridworld.train("agent=value_iteration", progress=False)
     assert table.model.shape == (30, 4)
@@ -145,7 +139,6 @@ def test_settings_are_those_of_the_command_line() -> None:
     ("given", "sentence"),
     [
         (("agent=dnq",), "agent=dnq: no such choice; choose from"),
-        (("agent.lr=3",), "no such setting in DQNConfig; did you mean learning_rate?"),
         (({"agent.gama": 0.9},), "did you mean gamma?"),
         (("seed=1,2",), "seed=1,2: has several values; call gridworld.sweep with them"),
         (("-m",), "-m: is not an override; write KEY=VALUE"),
@@ -156,7 +149,6 @@ def test_settings_are_those_of_the_command_line() -> None:
         (({"a b": 4},), "'a b': must be the name of a setting"),
         ((3,), "3: must be an override, such as 'agent=dqn', or a dictionary"),
         (("seed=x",), "seed=x: Value 'x' of type 'str' could not be converted to Integer"),
-        (("seed=[",), "seed="),
         (("total_timesteps=0",), "total_timesteps=0: must be at least 1"),
         (("recipe=nowhere.yaml",), "nowhere.yaml"),
     ],
@@ -257,9 +249,9 @@ def test_a_run_is_opened_within_the_budget_and_ones_own_needs_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GRIDWORLD_BUDGET", "1MB")
-    own = gridworld.train(
-        "agent=dqn", "env=cliff_walking_v1", *SMALL, folder=tmp_path / "run", progress=False
-    )
+    words = ("agent=dqn", "env=cliff_walking_v1", "agent.policy_kwargs.net_arch=[512,512]", *NO_FILES)
+    few = {"total_timesteps": 20, "agent.learning_starts": 10, "n_envs": 10}
+    own = gridworld.train(*words, few, folder=tmp_path / "run", progress=False)
     assert own.model is not None  # whatever it takes
     opened = gridworld.open_run(tmp_path / "run")
     with pytest.raises(InputError, match=r"its network: would take about .*set GRIDWORLD_BUDGET=1GB"):

@@ -42,7 +42,9 @@ class Scores(BaseCallback):
 
 
 @pytest.mark.parametrize("algorithm", [DQN, PPO])
-def test_its_scores_are_those_of_the_evaluator(algorithm: Any, tmp_path: Path) -> None:
+def test_its_scores_are_those_of_the_evaluator_and_training_goes_on_as_without_it(
+    algorithm: Any, tmp_path: Path
+) -> None:
     model = model_of(algorithm)
     model.set_logger(configure(str(tmp_path), ["csv"]))
     exact, asked = gridworld.ExactEvalCallback(every=100), Scores(100)
@@ -62,13 +64,8 @@ def test_its_scores_are_those_of_the_evaluator(algorithm: Any, tmp_path: Path) -
     assert np.allclose(by_step["eval/mean_reward"], found["return"])
     assert np.allclose(by_step["eval/mean_ep_length"], found["length"])
     assert np.allclose(by_step["eval/success_rate"], found["goal_probability"])
-
-
-@pytest.mark.parametrize("algorithm", [DQN, PPO])
-def test_training_goes_on_as_without_it(algorithm: Any) -> None:
-    with_it = model_of(algorithm).learn(640, callback=gridworld.ExactEvalCallback(every=50))
     without = model_of(algorithm).learn(640)
-    for one, other in zip(with_it.policy.parameters(), without.policy.parameters(), strict=True):
+    for one, other in zip(model.policy.parameters(), without.policy.parameters(), strict=True):
         assert bool((one == other).all())
 
 

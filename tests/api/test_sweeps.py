@@ -83,7 +83,7 @@ def test_mistakes_in_a_sweep(
 
 def test_folders_of_something_else(swept: gridworld.SweepResult, folder: Path) -> None:
     run = swept.runs[0].folder
-    with pytest.raises(InputError, match=r"not a sweep's folder, it has no sweep\.json"):
+    with pytest.raises(InputError, match="is a run's folder, not a sweep's"):
         gridworld.open_sweep(run or "")
     with pytest.raises(InputError, match="is a sweep"):
         gridworld.open_run(folder)

@@ -72,8 +72,10 @@ def test_a_table_passes_all_it_is_asked() -> None:
 def test_states_that_look_alike_are_alike_in_both_loops(kind: type) -> None:
     found = settings(subject(kind), BY_NAME["constant"], {})
     assert found is not None
+    steps = [expect._any(1, 0, expect.GOES_ON), expect._any(0, 1, expect.ENDS)]  # which are not chosen
+    world = expect._world("end like the start", steps)
     stock, tabulated = (
-        train(dataclasses.replace(found[0], engine=engine), expect.END_LIKE_THE_START, 0.9, 8, 640, 0).last
+        train(dataclasses.replace(found[0], engine=engine), world, 0.9, 8, 640, 0).last
         for engine in ("stock", "tabulated")
     )
     assert tabulated.values == pytest.approx(stock.values, abs=1e-4)
@@ -104,7 +106,7 @@ def test_two_of_three_seeds_decide(
 
 
 def trained(q: np.ndarray) -> Trained:
-    """A learner of Q on the alternation, which acts as it has learnt."""
+    """A learner of Q on the alternation, which acts as it has learned."""
     mdp = expect.ALTERNATION
     greedy = q.argmax(axis=1)
     last = PolicySnapshot(greedy, one_hot_policy(greedy, 2), q.max(axis=1), q)
@@ -123,7 +125,7 @@ def test_expectations_have_a_tolerance_and_tell_what_is_farthest() -> None:
         (expect.values, far, r"^Q\(1, 0\) 2.512, exact 2.222, tolerance 0.28$"),
         (expect.values, exact * np.nan, "nan"),
         (expect.optimal, -exact, r"its best actions are \[0, 0\], with regret 2.22"),
-        (expect.acts_as_learnt, exact, "50% of its last actions"),
+        (expect.acts_as_learned, exact, "50% of its last actions"),
         (expect.all_layers_learn, exact, r"^a.bias did not change$"),
     ):
         with pytest.raises(expect.UnmetError, match=words):
@@ -159,7 +161,7 @@ def test_the_command_ends_with_0_or_1(capsys: pytest.CaptureFixture[str]) -> Non
     assert ended.value.code == 1
     told = capsys.readouterr().out
     assert "constant     FAILED" in told
-    assert "\n    values are not learnt at all" in told
+    assert "\n    values are not learned at all" in told
     assert "failed 1 of 1 probes (constant)" in told
 
 
@@ -171,11 +173,12 @@ def test_two_processes_find_the_same() -> None:
 
 VALUES = [  # a world, a discount, and Q* of its live states
     (expect.CONSTANT, 0.9, [[1, 1]]),
-    (expect.CORRIDOR, 0.5, [[0.25, 0.25], [0.5, 0.5], [1, 1]]),
+    (expect.CORRIDOR, 0.5, [[0.25, 0.25], [0.5, 0.5], [1, 1], [0.4, 0.125]]),
     (expect.BANDIT, 0.9, [[0, 1, 0.5]]),
     (expect.TWO_CONTEXTS, 0.9, np.eye(2)),
-    (expect.END_LIKE_THE_START, 0.9, [[0.9, 0.9], [1, 1]]),
+    (expect.END_LIKE_THE_START, 0.9, [[0.7, 0.9], [1, 1]]),
     (expect.ENDLESS, 0.8, [[5, 5]]),
+    (expect.CUT_SHORT, 0.8, [[1.1, 4], [5, 5]]),
     (expect.GAMBLE, 0.9, [[0.1, 0.4]]),
     (expect.ALTERNATION, 0.8, [[0.8**2 / 0.36, 0.8 / 0.36], [0.8 / 0.36, 1 / 0.36]]),
     (expect.TRAP, 0.9, [[0.2, 0.7], [0, 1]]),
@@ -190,6 +193,6 @@ def test_their_values_are_those_that_the_page_tells(world: Mdp, gamma: float, q:
 def test_worlds_are_what_they_are_for() -> None:
     assert solved(expect.DELAY, 0.9).q[0] == pytest.approx([0.9**3, 0])
     assert solved(expect.SLIPPERY, 0.9).q[1, 1] == pytest.approx(0.8 / 0.82)
-    assert expect.END_LIKE_THE_START.number.tolist() == [0, 1, 0]  # its end looks like a live state
+    assert expect.END_LIKE_THE_START.number.tolist() == [0, 1, 0, 0]  # its ends look like a live state
     assert (expect.ENDLESS.max_episode_steps, expect.ENDLESS.terminal.any()) == (5, False)
     assert len({probe.name for probe in PROBES}) == len(PROBES)

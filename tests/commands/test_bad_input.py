@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from cases import table
+from helpers.own_class import any_class
 from helpers.support import NO_FILES, ROOT, SHORT, configure, train_in
 from hydra.errors import HydraException
 
@@ -28,32 +30,27 @@ YAMLS: dict[str, bytes] = {
     b"agent: {name: mine, algorithm: own_module.Mine}\n",
     "env/tagged.yaml": b"layout: !!python/object/apply:os.system [ls]\n",
     "env/misspelt.yaml": b"layuot: cliff\n",
+    "tune/misspelt.yaml": b"# @package tune.space\nagent.gamma: {type: float, lo: 0, high: 1}\n",
+    "tune/packless.yaml": b"agent.gamma: {type: float, low: 0, high: 1}\n",
     "own_module.py": b"1 / 0\n",
     "needy.py": b"import not_installed\n",
+    "own_callbacks.py": b"from stable_baselines3.common.callbacks import BaseCallback\n"
+    b"class Stirring(BaseCallback):\n    def _on_step(self): return True\n"
+    b"class Failing(BaseCallback):\n    def __init__(self): raise RuntimeError('no server')\n",
 }
 
 MAPS = {
     "unknown.txt": b"S.x\n..G\n",
-    "ragged.txt": b"S..\n.G\n",
-    "no_start.txt": b"...\n..G\n",
-    "no_goal.txt": b"S..\n...\n",
-    "empty.txt": b"",
-    "enclosed.txt": b"S#G\n.#.\n",
-    "binary.txt": bytes(range(128, 256)),
-    "large.txt": (b"." * 1000 + b"\n") * 300,
+    "large.txt": (b"." * 1000 + b"\n") * 300,  # for the others see world/test_layout.py
 }
 
 
-def table(title: str) -> list[tuple[str, str]]:
-    """(command line, a part of the sentence that refuses it) of the section with this title."""
-    text = Path(__file__).with_name("bad_input.txt").read_text("utf-8")
-    section = next(part for part in text.split("\n\n") if part.startswith(f"# {title}:"))
-    return [(line, words) for line, _, words in (row.partition("  =>  ") for row in section.splitlines()[1:])]
-
-
 # What the command line itself, Hydra or a file of the user's makes of it; the rest are settings that compose.
-OF_THE_COMMAND = re.compile(r"--|hydra\.|recipe=|\{conf\}|~|^[^=]*$|'|=null|=\[1|env=gymnasium|seed=(1,2|-1)")
-REFUSED = table("train.py")
+OF_THE_COMMAND = re.compile(
+    r"--|hydra\.|recipe=|\{conf\}|~|^[^=]*$|^\S+=\S+ \w+$|['\"]|=null|=\[1|env=gymnasium|seed=(1,2|-1)"
+)
+ANY_CLASS = " ".join(any_class("stable_baselines3.A2C"))
+REFUSED = table("commands/bad_input.txt", "train.py")
 OUT_OF_SIZE = "must be 0, or from"
 # Of the right type, and beyond what any number here holds.
 ABSURD = [
@@ -81,6 +78,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         path = folder / ("maps" if name in MAPS else "conf") / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
+    (folder / "run").mkdir()
+    (folder / "run" / "manifest.json").touch()
     return folder
 
 
@@ -90,12 +89,14 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ids=lambda value: value[:60],
 )
 def test_settings_are_refused_before_anything_is_written(
-    line: str, words: str, files: Path, tmp_path: Path
+    line: str, words: str, files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.syspath_prepend(files / "conf")
+    given = line.replace("{maps}", str(files / "maps")).replace("{class}", ANY_CLASS).split()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises((InputError, HydraException)) as mistake:
-            train(configure(*line.replace("{maps}", str(files / "maps")).split()), tmp_path, [])
+            train(configure(*given), tmp_path, [])
     told = sentence(mistake.value)
     assert words in told
     assert "\n" not in told
@@ -116,7 +117,8 @@ def test_train_refuses_before_it_writes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.syspath_prepend(files / "conf")
-    assert words in refusal(f"train.py {line}".replace("{conf}", str(files / "conf")))
+    line = line.replace("{conf}", str(files / "conf")).replace("{class}", ANY_CLASS)
+    assert words in refusal(f"train.py {line}")
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
@@ -150,7 +152,7 @@ def test_a_folder_that_cannot_be_a_runs_is_refused_and_left_alone(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize(("line", "words"), table("train.py -m"))
+@pytest.mark.parametrize(("line", "words"), table("commands/bad_input.txt", "train.py -m"))
 def test_a_sweep_is_refused_before_it_writes(
     line: str, words: str, tmp_path: Path, refusal: Callable[[str], str]
 ) -> None:
@@ -178,10 +180,18 @@ def test_slurm_is_started_where_it_is(
     assert told.startswith("error: hydra/launcher=slurm: no sbatch on this machine; start")
 
 
-@pytest.mark.parametrize(("line", "words"), table("the other scripts"))
+@pytest.mark.parametrize(("line", "words"), table("commands/bad_input.txt", "the other scripts"))
 def test_the_other_scripts_refuse_too(
-    line: str, words: str, tmp_path: Path, refusal: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
+    line: str,
+    words: str,
+    files: Path,
+    tmp_path: Path,
+    refusal: Callable[[str], str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    places = {"{conf}": str(files / "conf"), "{run}": str(files / "run")}
+    for name, place in places.items():
+        line, words = line.replace(name, place), words.replace(name, place)
     for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.setenv(name, "")
     assert words in refusal(line)

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import IO, Any
 
 import pytest
-from helpers.support import CONF, ROOT, SHORT, start
+from helpers.support import CONF, ROOT, SHORT, script, start
 
 from gridworld.base.errors import InputError
 from gridworld.commands import evaluate, run
 from gridworld.commands import record as record_command
 from gridworld.commands.manual import manual
+from gridworld.commands.tune import main as tune
 
 TRAINED_WITHOUT_NEEDLESS_IMPORTS = f"""
 import runpy, sys
@@ -84,12 +85,12 @@ def test_asking_imports_nothing_heavy(command: str, tmp_path: Path) -> None:
     modules = {line.rsplit("|", 1)[1].strip() for line in done.stderr.splitlines() if "|" in line}
     assert ("hydra" in modules) == ("train" in command)
     assert not modules & {"torch", "stable_baselines3", "gymnasium", "scipy", "pygame", "tensorboard"}
-    # A tabular agent's settings stand in one module with its arithmetic, and composing reads all settings.
+    # A tabular agent's settings are in one module with its arithmetic, and composing reads all settings.
     assert ("numpy" in modules) <= ("--cfg" in command)
 
 
 def test_evaluate_scores_again_exactly_and_by_sampling(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     evaluate.main([str(finished), "--episodes", "50"])
     output = capsys.readouterr().out
@@ -97,6 +98,9 @@ def test_evaluate_scores_again_exactly_and_by_sampling(
     value = next(line for line in output.splitlines() if line.strip().startswith("value"))
     assert float(value.split()[1]) == pytest.approx(summary["value"], abs=1e-4)
     assert "50 episodes" in output
+    monkeypatch.setenv("COLUMNS", "60")
+    evaluate.main([str(finished), "--episodes", "50", "--policy", "sampled"])
+    assert max(map(len, capsys.readouterr().out.split("on classic")[1].splitlines())) <= 60
 
     other = tmp_path / "other.txt"
     other.write_text("S....G\n......\n......\n......\n......\n")
@@ -112,24 +116,17 @@ def test_evaluate_scores_again_exactly_and_by_sampling(
 def test_record_writes_every_format_it_names(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    line = ["--format", "png", "gif", "apng", "mp4", "--cell-size", "11", "--fps", "7", "--policy", "sampled"]
-    record_command.main(
-        [str(finished), *line, "--episodes", "2", "--seed", "3", "--out", str(tmp_path / "out")]
-    )
+    films, maps = ["frames", "episode.gif", "episode.apng", "episode.mp4"], ["policy", "q_error", "visits"]
+    line = [str(finished), "--format", "png", "gif", "apng", "mp4", "--cell-size", "11", "--fps", "7"]
+    line += ["--policy", "sampled", "--episodes", "2", "--seed", "3", "--out", str(tmp_path / "films")]
+    record_command.main(line)
+    record_command.main([str(finished), "--format", *maps, "--out", str(tmp_path / "maps")])
     named = [Path(line) for line in capsys.readouterr().out.splitlines()]
-    assert [path.name for path in named] == ["frames", "episode.gif", "episode.apng", "episode.mp4"]
+    assert [path.name for path in named] == [*films, *(f"{name}.png" for name in maps)]
     assert all(path.exists() for path in named)
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in named}
-
-
-def test_record_draws_the_maps_again(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    maps = ["policy", "q_error", "visits"]
-    record_command.main([str(finished), "--format", *maps, "--out", str(tmp_path)])
-    assert [Path(line).name for line in capsys.readouterr().out.splitlines()] == [f"{m}.png" for m in maps]
-    for name in maps:
-        assert (tmp_path / f"{name}.png").read_bytes() == (finished / f"{name}.png").read_bytes()
+    assert set(tmp_path.glob("*/*")) == set(named)
+    for path in named[len(films) :]:
+        assert path.read_bytes() == (finished / path.name).read_bytes()
 
 
 def test_record_says_where_it_cannot_write(
@@ -158,3 +155,46 @@ def test_record_says_where_it_cannot_write(
         run(record_command.main)
     told = f"{out}/episode.gif: Permission denied; choose another folder, or make {out} writable"
     assert (ended.value.code, capsys.readouterr().err) == (2, f"error: {told}\n")
+
+
+# ---- what users of Hydra expect ----------------------------------------------------------------------------
+
+
+def test_a_job_in_its_own_folder_speaks_of_the_users(tmp_path: Path) -> None:
+    """And reads the user's map. What it prints can be typed where the command was typed."""
+    (tmp_path / "map.txt").write_text("S..\n.#G\n")
+    words = ["agent=q_learning", "env.layout=map.txt", "total_timesteps=300", "hydra.run.dir=runs/own"]
+    quiet = ["recording.frames=false", "recording.gif=false", "recording.learning=false"]
+    done = script("train.py", *words, *quiet, "hydra.job.chdir=true", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "  files: runs/own\n  curves: tensorboard --logdir runs\n" in done.stdout
+    again = script("train.py", *words, "hydra.job.chdir=true", cwd=tmp_path)
+    assert f"python {ROOT}/scripts/train.py resume=runs/own total_timesteps=" in again.stderr
+
+
+def test_tune_shows_what_train_would_run(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    words = ["agent=q_learning", "total_timesteps=1e3", "tune.trials=1e1"]
+
+    def shows(*more: str) -> str:
+        tune(more)
+        return capsys.readouterr().out
+
+    job = shows(*words, "--cfg", "job")
+    assert job == script("train.py", *words[:2], "--cfg", "job", cwd=tmp_path).stdout
+    whole = shows("--cfg", *words)
+    assert whole == shows(*words, "-c", "all") == shows(*words, "--cfg")
+    assert whole.startswith(job)
+    assert "\n  trials: 10\n" in whole
+    assert shows(*words, "-c", "job", "-p", "agent.gamma") == "# @package agent.gamma\n0.9\n"
+    assert shows(*words, "--cfg", "--package", "env").startswith(
+        "# @package env\nmax_episode_steps: 100\nlayout: classic\n"
+    )
+    for more, told in (
+        (["--cfg", "--package", "nowhere"], "--package nowhere: no such part of the configuration"),
+        (["-p", "env"], "--package env: shows a part of the configuration; use it with --cfg"),
+    ):
+        with pytest.raises(InputError, match=told):
+            shows(*words, *more)
+    with pytest.raises(SystemExit):
+        shows(*words, "--cfg", "hydra")
+    assert "invalid choice: 'hydra'" in capsys.readouterr().err

@@ -74,14 +74,10 @@ def test_what_is_typed_and_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["../scripts/train.py", "agent=dqn"])
     monkeypatch.chdir(ROOT / "docs")
     assert console.command("report") == "python ../scripts/report.py"
-    monkeypatch.chdir(ROOT)
-    assert console.command("report") == "python scripts/report.py"
     assert console.program("report") == "report.py"
     assert console.command_line() == ["python", "../scripts/train.py", "agent=dqn"]
     assert console.recorded_command_line() == ["train.py", "agent=dqn"]
-    monkeypatch.setattr(sys, "argv", ["notebook.py"])  # no command: as it is installed
-    assert console.command("report") == "python scripts/report.py"
-    monkeypatch.setattr(console, "_SCRIPTS", Path("nowhere"))
+    monkeypatch.setattr(sys, "argv", ["notebook.py"])
     assert console.command("report") == "gridworld report"
 
 
@@ -118,11 +114,13 @@ def test_the_wheel_holds_what_it_takes_to_train(wheel: Path) -> None:
         for suffix in ("py", "txt", "j2", "yml", "typed")
         for path in package.rglob(f"*.{suffix}")
     }
-    assert ours - names == {"gridworld/sweeps/hydra_plugin.py"}  # where Hydra looks for it:
-    assert "hydra_plugins/gridworld_sweeper.py" in names
+    moved = {"gridworld/sweeps/hydra_plugin.py", "gridworld/checking/pytest_plugin.py"}
+    assert ours - names == moved  # where Hydra and pytest look for them:
+    assert {"hydra_plugins/gridworld_sweeper.py", "pytest_gridworld.py"} <= names
     assert {name.split("/")[0] for name in names} == {
         "gridworld",
         "hydra_plugins",
+        "pytest_gridworld.py",
         f"gridworld_sb3-{__version__}.dist-info",
     }
 

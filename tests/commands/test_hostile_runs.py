@@ -25,6 +25,7 @@ WORDS = {
     "diagnose": ["run"],
     "reproduce": ["run"],
     "play": ["--agent", "run"],
+    "playground": ["run", "--out", "page.html"],
     "resume": ["resume=run", "total_timesteps=2500"],  # last, since it writes there
 }
 SCRIPTS = {command: f"{command}.py" for command in WORDS} | {"resume": "train.py"}
@@ -54,7 +55,7 @@ FIRST = {
 RUNS = SHORT | {"lake": [*SHORT["q_learning"], "env=frozen_lake_v1", "n_envs=4"]}  # which has tables
 ALL = os.environ.get("GRIDWORLD_HOSTILE") == "all"
 CASES = [case for case in CATALOGUE if ALL or case.name in FIRST]
-READERS = ("export", "diagnose", "reproduce", "play")
+READERS = ("export", "diagnose", "reproduce", "play", "playground")
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin
 
 import pytest
+from cases import table
 from helpers.support import CONF, NO_FILES, configure, train_in
 
 from gridworld.base.bounds import Bounds
@@ -113,37 +114,8 @@ def recipe(tmp_path: Path, content: str) -> list[str]:
 
 
 GYM = "defaults: [{override /env: gymnasium}]\nenv: "
-CLASS = "defaults: [{override /agent: qrdqn}]\nagent: "
-HOSTILE = {
-    "defaults: [{override /env: built}]\nenv: {builder: os.system, kwargs: {command: ls}}": "env.builder=",
-    "env: {builder: os.system}": "env.builder=os.system is called",  # whichever env the command line chooses
-    GYM + '{id: "evil:Env-v0"}': "env.id=evil:Env-v0 imports the module",
-    GYM
-    + "{id: FrozenLake-v1, kwargs: {layout: /etc/shadow}}": "env.kwargs.layout=/etc/shadow is passed to code",
-    GYM + "{id: X-v0, kwargs: {a: [{b: ../x}]}}": "env.kwargs.a.b=../x is passed to code",
-    GYM + "{id: X-v0, kwargs: {env_id: 'evil:X-v0'}}": "env.kwargs.env_id=evil:X-v0 is passed to code",
-    GYM + "{id: X-v0, kwargs: {size: 1000000000}}": "env.kwargs.size=1000000000 is beyond 1,000",
-    GYM + "{id: X-v0, kwargs: {size: -.inf}}": "env.kwargs.size=-inf is beyond 1,000",
-    "callbacks: [{_target_: os.system, command: ls}]": "callbacks._target_=os.system is called",
-    "callbacks: [{_target_: stable_baselines3.common.callbacks.CheckpointCallback, save_path: /x}]": "writ",
-    "callbacks: [os.system]": "callbacks=os.system is called",
-    "defaults: [{override /env: arrays}]\nenv: {path: /etc/shadow}": "env.path=/etc/shadow leads out of",
-    "env: {layout: /etc/shadow}": "env.layout=/etc/shadow leads out of the current folder",
-    "env: {layout: maps/../../x}": "env.layout=maps/../../x leads out",
-    "env: {layout: link/x}": "env.layout=link/x leads out",
-    'env: {layout: "a\\0b"}': "env.layout=a\\x00b leads out",
-    CLASS + "{algorithm: evil.Agent}": "agent.algorithm=evil.Agent is not from one of",
-    CLASS + "{algorithm: stable_baselines3_evil.A}": "agent.algorithm=stable_baselines3_evil.A is not from",
-    CLASS + "{policy: evil.Policy}": "agent.policy=evil.Policy is not from one of",
-    CLASS + "{arguments: {policy_kwargs: {optimizer_class: evil.Adam}}}": "class=evil.Adam is neither",
-    CLASS + "{arguments: {whatever: [[evil.Adam]]}}": "agent.arguments.whatever=evil.Adam is neither a plain",
-    CLASS + "{arguments: {tensorboard_log: /tmp/x}}": "agent.arguments.tensorboard_log=/tmp/x is neither",
-    "agent: {policy_kwargs: {activation_fn: os.system}}": "activation_fn=os.system is not from one of",
-    "agent: {policy_kwargs: {features_extractor_kwargs: {a: evil.X}}}": "a=evil.X is neither a plain",
-    "agent: {policy_kwargs: {optimizer_kwargs: {_target_: os.system}}}": "_target_=os.system is neither",
-    "agent: {replay_buffer_class: evil.Buffer}": "agent.replay_buffer_class=evil.Buffer is not from one of",
-    "agent: {rollout_buffer_kwargs: {path: a/b}}": "agent.rollout_buffer_kwargs.path=a/b is neither",
-}
+HOSTILE = dict(table("config/cases.txt", "recipes for trust"))
+HOSTILE['env: {layout: "a\\0b"}'] = "env.layout=a\\x00b leads out"
 
 
 @pytest.mark.parametrize("content", HOSTILE, ids=range(len(HOSTILE)))

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from cases import table
 from helpers.support import CONF, NO_FILES, configure, script, train_in
 
 import gridworld
@@ -11,54 +12,11 @@ from gridworld.agents.sb3.settings import REPLAY_COUNTS
 from gridworld.config.train import TrainConfig
 from gridworld.training.setup import check_settings, notes
 
-LARGE = "env.num_rows=9 env.num_cols=9"
-
-
-CHOSEN = [  # (command line, recipe, preset)
-    ("", None, "auto"),
-    ("env.slip=0.1", None, "stochastic"),
-    ("env.slip=0.1 agent=ppo", None, "stochastic"),
-    ("env.slip=0.1 agent=q_learning", None, "stochastic"),
-    ("env.slip=0.1 agent=value_iteration", None, "auto"),  # it has no such settings
-    ("env.slip=0.1 agent=sarsa", None, "auto"),
-    ("preset=stochastic agent=sarsa", None, "none"),
-    ("env.slip=0.1 total_timesteps=9600000", None, "auto"),
-    ("env.slip=0.1 agent=dqn_sb3_defaults", None, "auto"),
-    (LARGE, None, "large"),
-    (f"{LARGE} total_timesteps=1000", None, "auto"),
-    ("env=cliff tuned=none total_timesteps=1000", None, "auto"),
-    ("env.num_rows=4 env.num_cols=4", None, "auto"),
-    ("env.slip=0.1 agent.gamma=0.5", None, "stochastic"),  # settings of the agent go before it
-    # What a preset's numbers rest on is given, or the engine that they are made for is not used.
-    ("env.slip=0.1 total_timesteps=1000", None, "auto"),
-    ("env.slip=0.1 n_envs=8", None, "auto"),
-    ("env.slip=0.1 agent.engine=stock", None, "auto"),
-    ("env.slip=0.1 callbacks=[{_target_:mine.Own}]", None, "auto"),
-    # By name.
-    ("env.slip=0.1 preset=none", None, "none"),
-    ("preset=stochastic", None, "stochastic"),
-    ("env.slip=0.1 preset=large", None, "large"),
-    # A recipe is for the world as its yaml has it.
-    ("env=cliff", "cliff_dqn", "auto"),
-    ("env=cliff env.max_episode_steps=50", "cliff_dqn", "auto"),
-    ("env=cliff env.step_reward=-0.5", "cliff_dqn", "auto"),
-    ("env=cliff env.slip=0.1", None, "stochastic"),
-    ("env=cliff env.slip=0.1 preset=none", "cliff_dqn", "none"),
-    ("env=cliff tuned=none", None, "auto"),
-    ("env=cliff env.slip=0.1 tuned=cliff_dqn", "cliff_dqn", "auto"),
-    ("env.layout=cliff", None, "large"),
-    ("env=frozen_lake_4x4", "frozen_lake_4x4_dqn", "auto"),
-    # Settings that make no world: the check before training says what is wrong with them.
-    ("env.slip=3", None, "auto"),
-    ("env.layout=nothing", None, "auto"),
-    ("env=built env.builder=nothing.at_all", None, "auto"),
-]
-
 
 def test_one_rule_chooses() -> None:
-    for words, recipe, preset in CHOSEN:
+    for words, recipe, preset in table("config/cases.txt", "presets"):
         config = configure(*words.split())
-        assert (config.recipe, config.preset) == (recipe, preset), words
+        assert (str(config.recipe), config.preset) == (recipe, preset), words
 
 
 def test_the_numbers_of_a_preset_pass_the_checks() -> None:
@@ -84,6 +42,10 @@ def test_a_preset_is_chosen_alike_from_python_and_by_the_command(tmp_path: Path)
     assert "${" not in shown
     assert "preset: stochastic" in shown
     assert "total_timesteps: 24000000" in shown
+    (tmp_path / "mine" / "env").mkdir(parents=True)
+    (tmp_path / "mine" / "env" / "icy.yaml").write_text("slip: 0.1")
+    shown = script("train.py", "--cfg", "job", "--config-dir", "mine", "env=icy", cwd=tmp_path).stdout
+    assert "preset: stochastic" in shown
 
 
 def test_each_job_of_a_sweep_has_its_own_preset_and_a_line_says_so(tmp_path: Path) -> None:

@@ -1,51 +1,70 @@
 """The programs and the notebook of docs/examples run as they stand there."""
 
+import base64
+import io
 import os
+import re
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from helpers.pages import module_of
 from helpers.support import ROOT, script
+from PIL import Image
 
 EXAMPLES = ROOT / "docs" / "examples"
-TOLD = {
+PRINTED = {
     "train_and_look.py": "from the start it goes",
     "exact_callback_with_plain_sb3.py": "the best model: regret 0.000, certified optimal: True",
     "score_your_own_table.py": "certified optimal",
     "family_of_worlds.py": "| all | 1 | 1 | 1 | 1 |",
+    "check_a_numpy_agent.py": "train: passed all 11 probes",
 }
 ARGUMENTS = {"family_of_worlds.py": ["dqn", "--pairs", "2", "--observations", "one_hot"]}
 
 
 def test_all_examples_are_tried() -> None:
-    assert {path.name for path in EXAMPLES.glob("*.py")} == set(TOLD)
+    assert {path.name for path in EXAMPLES.glob("*.py")} == set(PRINTED)
 
 
-@pytest.mark.parametrize("name", TOLD)
+@pytest.mark.parametrize("name", PRINTED)
 def test_an_example(name: str, tmp_path: Path) -> None:
     done = script(str(EXAMPLES / name), *ARGUMENTS.get(name, []), cwd=tmp_path, OMP_NUM_THREADS="1")
     assert done.returncode == 0, done.stderr
-    assert TOLD[name] in done.stdout
+    assert PRINTED[name] in done.stdout
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_the_notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import nbclient
+def test_the_notebook_shows_what_is_stored_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import nbformat
 
+    notebook = module_of("notebook")
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
-    notebook = nbformat.read(EXAMPLES / "quickstart.ipynb", 4)
-    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in notebook.cells)
-    place = {"metadata": {"path": str(tmp_path)}}
-    nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3", resources=place).execute()
-    outputs = [each for cell in notebook.cells for each in cell.get("outputs", [])]
-    output, shown = str(outputs), [each["data"] for each in outputs if "data" in each]
-    assert "RunResult(dqn on classic, seed 0" in output
+    done = notebook.execute(tmp_path)
+    output = str([each for cell in done.cells for each in cell.get("outputs", [])])
     assert "dqn on classic: step 0 of 30,000 (0%)" in output
     assert "(100%), regret 0" in output
-    assert "6 jobs: 6 done" in output
-    assert sum("image/png" in data for data in shown) == 2  # a curve and a policy
-    assert [data["text/html"].count("<img ") for data in shown if "text/html" in data] == [2, 0]
+    shown, stored = _shown(notebook.to_store(done)), _shown(nbformat.read(notebook.NOTEBOOK, 4))
+    assert [text for text, _ in shown] == [text for text, _ in stored]
+    for (_, pictures), (_, kept) in zip(shown, stored, strict=True):
+        for one, other in zip(pictures, kept, strict=True):
+            assert np.abs(one - other).mean() < 8, "draw it again: python docs/notebook.py"  # of 255
+    assert sum(len(pictures) for _, pictures in stored) == 4  # two curves and two policies
+
+
+def _shown(notebook: Any) -> list[tuple[str, list[Any]]]:
+    """Of each output its text without numbers, which a processor may change, and its pictures, made small."""
+    found = []
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            text = output.data.get("text/html", "") + output.data["text/plain"]
+            coded = [*re.findall(r"base64,([^\"]+)", text), *filter(None, [output.data.get("image/png")])]
+            pictures = [Image.open(io.BytesIO(base64.b64decode(each))) for each in coded]
+            small = [np.asarray(each.convert("L").resize((64, 64)), float) for each in pictures]
+            found.append((re.sub(r"base64,[^\"]+|[\d.,]+(e-\d+)?", "#", text), small))
+    return found

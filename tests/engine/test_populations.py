@@ -202,7 +202,7 @@ WRITTEN: dict[str, tuple[str, Words]] = {
     "ppo one sample": ("ppo", ("agent.n_steps=2", *ONE_SAMPLE)),
     "ppo whole rollout": ("ppo", ("agent.batch_size=32", "agent.n_epochs=4", "agent.target_kl=0.002")),
     "ppo one environment": ("ppo", ("n_envs=1", "agent.n_steps=15", "agent.batch_size=5")),
-    "ppo on images": ("ppo", ("observation=image", f"{KWARGS}.net_arch=[33,5,16]")),
+    "ppo on images": ("ppo", ("observation=image", f"{KWARGS}.net_arch=[33,5,16]", "agent.n_epochs=1")),
     "ppo of two sizes": ("ppo", ("observation=coordinates", f"{KWARGS}.net_arch={{pi:[9],vf:[4,3]}}")),
     "ppo by torch": ("ppo", (f"{KWARGS}.activation_fn=torch.nn.ELU", f"{KWARGS}.net_arch=[16,16]")),
     "a2c one step": ("a2c", (f"{LATER}.n_steps=1", "total_timesteps=24")),

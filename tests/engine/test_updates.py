@@ -128,7 +128,8 @@ def test_updates_from_rollouts(
         arguments = {"n_epochs": 1, "batch_size": 256, **arguments}
         if few_states == 0:  # many updates follow each other, in which Adam would blow rounding up
             kwargs = {**SGD, "optimizer_kwargs": {}, **arguments.get("policy_kwargs", {})}
-            arguments |= {"batch_size": min(16, arguments["batch_size"]), "policy_kwargs": kwargs}
+            fewest = 16 if kind != "image" else 64  # each takes long
+            arguments |= {"batch_size": min(fewest, arguments["batch_size"]), "policy_kwargs": kwargs}
     elif few_states == 0:
         n_steps = 1  # fewer samples than states
     if algorithm is TRPO:

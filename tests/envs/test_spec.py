@@ -13,7 +13,6 @@ from gridworld import GridWorldEnv, InputError
 
 WORLD = World(DEFAULT_ROWS)
 UP, RIGHT, DOWN, LEFT = range(4)
-SHORTEST = (*[RIGHT] * 5, DOWN, DOWN, LEFT)
 
 
 @pytest.fixture
@@ -53,16 +52,6 @@ def test_the_tutorials_attributes(env):
         }
 
 
-@pytest.mark.parametrize(("num_rows", "num_cols"), [(4, 3), (5, 3), (4, 4), (7, 9), (12, 5), (9, 4)])
-def test_other_sizes_follow_the_formula(num_rows, num_cols):
-    env = GridWorldEnv(num_rows, num_cols)
-    row, col = num_rows // 2, num_cols - 2
-    assert env.gold_cell == (row, col)
-    assert list(env.trap_cells) == [(row + 1, col), (row, col - 1), (row - 1, col)]
-    assert env.observation_space.n == num_rows * num_cols
-    assert env.gold_state == row * num_cols + col
-
-
 def test_reset_returns_the_corner(env):
     parameters = inspect.signature(env.reset).parameters
     assert {name: (p.kind, p.default) for name, p in parameters.items()} == {
@@ -88,14 +77,16 @@ def test_every_step_has_the_rewards_and_types_of_the_table(env):
 
 
 @pytest.mark.parametrize("state", [16, 22, 15, 10])
-def test_stepping_on_after_the_end_changes_nothing(env, state):
-    env.reset()
+def test_stepping_on_after_the_end_changes_nothing_and_draws_nothing(state):
+    env = GridWorldEnv(slip=0.3)
+    env.reset(seed=0)
     env.state = state
+    before = env.np_random.bit_generator.state
     for action in MOVES:
         result = env.step(action)
         assert result == (state, 0.0, True, False, {})
         assert [type(value) for value in result] == [int, float, bool, bool, dict]
-    assert env.state == state
+    assert (env.state, env.np_random.bit_generator.state) == (state, before)
 
 
 @pytest.mark.parametrize("state", [-1, 30, 1.0, "3", None, True])
@@ -113,13 +104,6 @@ def test_the_registered_id_truncates_after_100_steps_and_the_class_never():
     assert env.reset() == (0, {})
     assert [env.step(UP)[3] for _ in range(100)] == [False] * 99 + [True]
     assert [env.unwrapped.step(UP) for _ in range(1000)] == [(0, 0.0, False, False, {})] * 1000
-
-
-def test_the_shortest_way_takes_eight_steps(env):
-    env.reset()
-    assert [env.step(action)[1] for action in SHORTEST] == [0.0] * 7 + [1.0]
-    entrances = [s for s in WORLD.cells for a in MOVES if WORLD.moved(s, a) == (2, 4) and not WORLD.ends(s)]
-    assert entrances == [(2, 5)]
 
 
 def test_get_coords(env):

@@ -8,8 +8,10 @@ from helpers.oracle import MOVES, worlds
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gridworld import GridWorldVectorEnv, InputError
+from gridworld import GridWorldEnv, GridWorldVectorEnv, InputError
+from gridworld.envs.vector_env import stratified_numbers
 from gridworld.world.layout import parse
+from gridworld.world.mdp import FloatArray, IntArray
 
 MODES = list(AutoresetMode)
 TWO_STARTS = parse("S..T\n.#..\nS..G", "two starts")
@@ -70,6 +72,12 @@ def test_a_batch_equals_gymnasiums_own(num_envs, arguments, mode):
             options = {"reset_mask": over}
             assert np.array_equal(native.reset(options=options)[0], copies.reset(options=options)[0])
     assert endings > 10
+    while not over.any():
+        over = np.any([native.step(actions)[2:4], copies.step(actions)[2:4]], axis=(0, 1))
+    assert np.array_equal(
+        native.reset(seed=6)[0], copies.reset(seed=6)[0]
+    )  # of one that waits for its own, too
+    assert same(native.step(actions), copies.step(actions))
 
 
 def test_without_a_limit_nothing_is_cut_off_and_an_end_stays():
@@ -197,3 +205,33 @@ def test_returned_arrays_are_fresh(mode):
         infos = mine[4]
         for part in (*mine[:4], *(infos[key] for key in infos if key != "final_info")):
             part[:] = 1
+
+
+# ---- draws that environments share out evenly: each one's own chances stay what they are ----
+
+GROUPS = st.lists(st.integers(0, 9), min_size=1, max_size=60).map(np.array)
+
+
+def by_hand(groups: IntArray, rng: np.random.Generator) -> FloatArray:
+    """Group by group, member by member."""
+    numbers = np.empty(len(groups))
+    for group in sorted(set(groups.tolist())):
+        shift = rng.random()
+        members = [place for place, other in enumerate(groups) if other == group]
+        for rank, place in enumerate(members):
+            numbers[place] = (rank / len(members) + shift) % 1.0
+    return numbers
+
+
+@given(GROUPS, st.integers(0, 2**32 - 1), st.sampled_from([0, 70_000]))
+def test_the_numbers_are_those_of_a_loop_over_groups(groups: IntArray, seed: int, first: int) -> None:
+    found, expected = np.random.default_rng(seed), np.random.default_rng(seed)
+    assert np.array_equal(stratified_numbers(groups + first, found), by_hand(groups, expected))
+    assert found.bit_generator.state == expected.bit_generator.state
+
+
+def test_the_starts_are_spread_over_the_states() -> None:
+    mdp = GridWorldEnv().mdp.with_exploring_starts(1.0)
+    envs = GridWorldVectorEnv(len(mdp.start_states) * 7, mdp=mdp, stratified=True)
+    states, _ = envs.reset(seed=0)
+    assert (np.bincount(states)[mdp.start_states] == 7).all()

@@ -108,6 +108,8 @@ def test_wandb(place: Path) -> None:
 def test_wandb_while_it_trains(tmp_path: Path) -> None:
     """Two runs that train together, and an agent of SB3's own loop with W&B's callback."""
     callback = "callbacks=[{_target_: wandb.integration.sb3.WandbCallback, verbose: 0}]"
+    done = script("train.py", *SHORT["ppo"], callback, cwd=tmp_path)
+    assert "You must call wandb.init() before WandbCallback(); logging.wandb=true calls it" in done.stderr
     words = [*SHORT["ppo"], *NO_FILES, "logging.wandb=true"]
     for more in (
         ["-m", "seed=0,1", "hydra.sweep.dir=runs"],
@@ -291,16 +293,7 @@ def test_only_what_the_manifest_vouches_for_is_exported(lake: Path, tmp_path: Pa
     assert found.keys() - as_read(run, tmp_path / "without").keys() == {"episode.gif"}
 
 
-def test_the_hub_gets_the_tables_of_the_run(
-    lake: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    export.main([str(lake), "--to", "hub", "--out", "hub"])
-    [world] = (tmp_path / "hub").glob("*/world.npz")
-    assert world.read_bytes() == (lake / "world.npz").read_bytes()
-
-
-def test_of_a_run_that_was_changed_nothing_is_written(
+def test_the_hub_gets_the_tables_of_the_run_and_nothing_of_one_that_was_changed(
     lake: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -310,6 +303,9 @@ def test_of_a_run_that_was_changed_nothing_is_written(
     with pytest.raises(InputError, match=r"run/curve.csv: is not the file that the run wrote"):
         export.main(["run", "--to", "hub", "--out", "hub"])
     assert not Path("hub").exists()
+    export.main([str(lake), "--to", "hub", "--out", "hub"])
+    [world] = (tmp_path / "hub").glob("*/world.npz")
+    assert world.read_bytes() == (lake / "world.npz").read_bytes()
 
 
 @pytest.mark.parametrize("to", ["wandb", "mlflow"])

@@ -8,10 +8,9 @@ import importlib
 import json
 import multiprocessing
 import os
-import select
 import signal
 import subprocess
-import time
+import threading
 from dataclasses import dataclass, field
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection
@@ -54,9 +53,7 @@ def run(
     """Run one of the scripts in `cwd`, which prints to the file `stdout`, or to what comes back.
 
     With `secret` it may write to `cwd` and nowhere else, and whoever opens a file of that name is noted.
-
-    Raises:
-        subprocess.TimeoutExpired: It took longer than `timeout` seconds, and was killed.
+    Where it takes longer than `timeout` seconds it is killed, and `subprocess.TimeoutExpired` raised.
     """
     with TemporaryDirectory(prefix="forks-") as place:
         out, err, report = stdout or Path(place) / "out", Path(place) / "err", Path(place) / "report"
@@ -93,7 +90,7 @@ class Started:
         return self._process.exitcode
 
     def poll(self) -> int | None:
-        """The same."""
+        """The same, as `subprocess.Popen` has it."""
         return self.returncode
 
     def wait(self, timeout: float) -> int:
@@ -105,14 +102,12 @@ class Started:
 
     def communicate(self, timeout: float) -> tuple[None, str]:
         """What is left of its standard error, which its children may hold too, once it has ended."""
-        end, told = time.monotonic() + timeout, b""
-        while select.select([self.stderr], [], [], max(0.0, end - time.monotonic()))[0]:
-            part = os.read(self.stderr.fileno(), 2**16)
-            if not part:
-                self.wait(max(1.0, end - time.monotonic()))
-                return None, told.decode()
-            told += part
-        raise subprocess.TimeoutExpired(str(self.pid), timeout, stderr=told)
+        killer = threading.Timer(timeout, os.killpg, (self.pid, signal.SIGKILL))
+        killer.start()
+        told = self.stderr.read()
+        killer.cancel()
+        self.wait(timeout)
+        return None, told
 
     def send_signal(self, number: int) -> None:
         """Send a signal, unless it has ended."""

@@ -36,6 +36,7 @@ from gridworld.world.layout import load
 
 OURS = (InputError, OmegaConfBaseException)  # both end as one sentence with exit code 2
 Target = Callable[[random.Random, Path], None]
+AGENTS = ("a2c", "dqn", "sarsa")  # whose good runs there are
 
 # Odd values of every type. What is large is so large that no machine has room for it, or small enough.
 # fmt: off
@@ -108,7 +109,7 @@ def spoil(random: random.Random, content: dict[Any, Any]) -> None:
 
 def fuzz_manifest(random: random.Random, folder: Path) -> None:
     """A run's folder whose manifest, summary or curve was changed, by meaning or by bytes."""
-    run = fresh_copy(random, folder)
+    run = fresh_copy(folder, random.choice(AGENTS))
     name = random.choice(["manifest.json", "manifest.json", "manifest.json", "summary.json", "curve.csv"])
     raw = (run / name).read_bytes()
     if name.endswith(".json") and random.random() < 0.7:
@@ -131,7 +132,7 @@ def fuzz_manifest(random: random.Random, folder: Path) -> None:
 
 def fuzz_model(random: random.Random, folder: Path) -> None:
     """A model file with changed bytes, whose checksum was made to fit."""
-    run = fresh_copy(random, folder)
+    run = fresh_copy(folder, random.choice(AGENTS))
     seal(run, "model.zip", damaged(random, (run / "model.zip").read_bytes()))
     snapshot = SavedRun(run).snapshot()
     assert all(math.isfinite(value) for value in snapshot.values)
@@ -139,7 +140,7 @@ def fuzz_model(random: random.Random, folder: Path) -> None:
 
 def fuzz_sweep(random: random.Random, folder: Path) -> None:
     """A sweep's folder with something changed, by meaning or by bytes, as jobs.py lists it."""
-    sweep = whole_copy(folder, "sweep")
+    sweep = fresh_copy(folder, "sweep")
     names = ["sweep.json", "sweep.json", "jobs.csv", "seed=0/manifest.json", "seed=0/summary.json"]
     change(random, sweep / random.choice(names))
     with contextlib.redirect_stdout(io.StringIO()) as told:
@@ -149,7 +150,7 @@ def fuzz_sweep(random: random.Random, folder: Path) -> None:
 
 def fuzz_study(random: random.Random, folder: Path) -> None:
     """A study's folder with something changed, as a report shows it."""
-    study = whole_copy(folder, "study")
+    study = fresh_copy(folder, "study")
     change(random, study / random.choice(["study.json", "study.json", "trials.csv", "search.json"]))
     is_claimed(study, "mine")
     found, problems = find_tunings([study])
@@ -183,22 +184,11 @@ def change(random: random.Random, path: Path) -> None:
         seal(path.parent, name)
 
 
-def whole_copy(folder: Path, name: str) -> Path:
-    """Of the good sweep or study."""
-    copy = folder / name
+def fresh_copy(folder: Path, name: str) -> Path:
+    """Of the good sweep, study, or run of an agent."""
+    copy = folder / "copy"
     shutil.rmtree(copy, ignore_errors=True)
     return shutil.copytree(folder / f"good-{name}", copy)
-
-
-def fresh_copy(random: random.Random, folder: Path) -> Path:
-    """Of one of the runs that `folder` has."""
-    good = random.choice([folder / f"good-{agent}" for agent in ("a2c", "dqn", "sarsa")])
-    run = folder / "run"
-    shutil.rmtree(run, ignore_errors=True)
-    run.mkdir()
-    for name in ("manifest.json", "summary.json", "curve.csv", "model.zip", "visits.npy"):
-        shutil.copy(good / name, run / name)
-    return run
 
 
 TARGETS: dict[str, Target] = {

@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib
+import importlib.util
 import io
 import re
 import shlex
@@ -11,6 +12,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import yaml
 from helpers.support import ROOT, configure, script
@@ -63,6 +65,16 @@ def blocks(page: Path, *languages: str) -> list[Block]:
     return [block for block in found if not languages or block.language in languages]
 
 
+def module_of(name: str) -> Any:
+    """A module of docs/."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def shortened(words: list[str]) -> list[str]:
     """The same command over fewer steps, seeds and trials."""
     program, *rest = words
@@ -88,14 +100,10 @@ def _replaced(words: list[str], others: list[str]) -> list[str]:
 
 
 class Reader:
-    """Goes through pages in one folder, which looks like the repository from the inside.
+    """Goes through pages in one empty folder, which looks like the repository from the inside.
 
-    A line that was run in it before is not run again: a page may repeat what another has.
-
-    Args:
-        folder: an empty one.
-        claims: by a part of a command line: what it prints, and the words that are added to it; it is not
-            shortened otherwise.
+    A line that was run in it before is not run again: a page may repeat what another has. `claims` has, by a
+    part of a command line, what it prints and the words that are added to it; it is not shortened otherwise.
     """
 
     def __init__(self, folder: Path, claims: Mapping[str, tuple[str, list[str]]]) -> None:

@@ -30,19 +30,12 @@ def random_map(number: str) -> str:
 
 @dataclass(frozen=True)
 class Sabotage:
-    """One way to spoil a run.
+    """One way to spoil a run."""
 
-    Attributes:
-        agent: `q_learning`, `sarsa`, `dqn`, `ppo`, or the name of a class in `planted_bugs`.
-        name: what was done.
-        words: by which settings.
-        causes: those that name it.
-    """
-
-    agent: str
-    name: str
-    words: tuple[str, ...]
-    causes: tuple[str, ...]
+    agent: str  # `q_learning`, `sarsa`, `dqn`, `ppo`, or the name of a class in `planted_bugs`
+    name: str  # what was done
+    words: tuple[str, ...]  # by which settings
+    causes: tuple[str, ...]  # those that name it
 
     def __str__(self) -> str:
         return f"{self.agent}: {self.name}"

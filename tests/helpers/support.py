@@ -62,10 +62,9 @@ DEEP = ["dqn", "ppo"]  # those with a tabulated engine
 
 
 def configure(*overrides: str) -> TrainConfig:
-    """The configuration that the command line would give to a run.
+    """The configuration that the command line would give to a run, composed as that of a sweep's job.
 
-    Composed as a sweep composes its jobs: the files of each choice are read once. It comes to the same, see
-    tests/sweep/test_sweep_plan.py, in 3 ms instead of 100.
+    It comes to the same, see tests/sweep/test_sweep_plan.py, in 3 ms instead of 100.
     """
     return copy.deepcopy(_composed(overrides))
 
@@ -115,16 +114,9 @@ def script(
 ) -> subprocess.CompletedProcess[str]:
     """Run one of the scripts as a user does, from another folder.
 
-    Args:
-        name: Its file, e.g. `train.py`.
-        arguments: The words on its command line.
-        cwd: The folder to run it in.
-        real: Start Python for it. Otherwise it runs in a fork of a process that has imported everything,
-            which takes seconds less; see `helpers.warm` for the difference.
-        stdout: A file that a fork prints to, instead of to what comes back.
-        timeout: The seconds that it may take.
-        environment: Variables beside those of this process. One that Python reads when it starts makes
-            the process a real one.
+    It runs in a fork of a process that has imported everything, which takes seconds less (`helpers.warm`), or
+    in a `real` Python; so it does with a variable in `environment` that Python reads when it starts. A fork
+    may print to the file `stdout`, instead of to what comes back.
     """
     if not real and not any(map(_READ_AT_START.match, environment)):
         ended = forks.run(name, *arguments, cwd=cwd, environment=environment, timeout=timeout, stdout=stdout)

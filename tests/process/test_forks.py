@@ -1,11 +1,9 @@
 """How the tests start scripts: in a fork of a warm process one runs as in a process of its own."""
 
 import json
-import re
 from pathlib import Path
 
-from helpers.resuming import differences, left_behind
-from helpers.support import SHORT, script
+from helpers.support import script
 
 PROBE = """
 import atexit, json, os, random, signal, sys, threading
@@ -38,13 +36,3 @@ def test_a_fork_starts_and_ends_as_a_process_of_its_own(tmp_path: Path) -> None:
         told.append((done.returncode, json.loads(state), done.stderr.splitlines()[-1:]))
     assert told[2] == told[1] == told[0]
     assert len(set(chance)) == len(chance) == 9
-
-
-def test_a_run_in_a_fork_has_the_same_files_and_output(tmp_path: Path) -> None:
-    printed = []
-    for name, real in (("own", True), ("fork", False)):
-        done = script("train.py", *SHORT["dqn"], f"hydra.run.dir={name}", cwd=tmp_path, real=real)
-        assert done.returncode == 0, done.stderr
-        printed.append(re.sub(r"[\d.]+ (s|ms|steps/s)\b|\b(own|fork)\b", "#", done.stdout))
-    assert printed[0] == printed[1]
-    assert differences(left_behind(tmp_path / "own"), left_behind(tmp_path / "fork")) == []

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from gridworld.base.processes import LostError, Processes
+from gridworld.base.processes import Processes
 from gridworld.base.signals import Interrupted, StopRequest
 
 
@@ -27,10 +27,6 @@ def write(folder: Path, number: int) -> int:
     return number
 
 
-def is_killed() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
 @pytest.mark.parametrize("forks", [True, False])
 def test_each_task_has_its_result_and_all_processes_end(forks: bool, tmp_path: Path) -> None:
     assert run([partial(write, tmp_path, number) for number in range(7)], 2, forks) == list(range(7))
@@ -40,13 +36,6 @@ def test_each_task_has_its_result_and_all_processes_end(forks: bool, tmp_path: P
     for process in processes:
         with pytest.raises(ProcessLookupError):
             os.kill(int(process), 0)
-
-
-def test_a_killed_process_takes_no_other_task_along(tmp_path: Path) -> None:
-    lost, *others = run([is_killed, *(partial(write, tmp_path, number) for number in range(3))])
-    assert isinstance(lost, LostError)
-    assert str(lost) == "exit code -9"
-    assert others == [0, 1, 2]
 
 
 def works(folder: Path, number: int) -> None:

@@ -68,7 +68,7 @@ def test_a_browser_shows_it(page: Path, tmp_path: Path) -> None:
             *("a2c", "dqn", "q_learning", "sarsa", "ppo (learning_rate=0.0123)"),
             *(
                 "On classic, dqn is certified optimal on all 6 seeds",
-                "1 run is in no statistic",
+                "1 run is not in the statistics",
                 "boom",
             ),
         ):

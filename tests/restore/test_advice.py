@@ -16,14 +16,14 @@ SHORT = ["total_timesteps=200", "evaluation.every=20", *NO_FILES]
 @pytest.mark.parametrize(
     ("words", "reason", "command"),
     [
-        (["env=cliff", "tuned=none"], "its recipe:", "train.py agent=q_learning env=cliff"),
-        (["env.layout=four_rooms"], "its recipe:", "train.py agent=q_learning env=four_rooms"),
+        (["env=cliff", "tuned=none"], "its recipe:", "train agent=q_learning env=cliff"),
+        (["env.layout=four_rooms"], "its recipe:", "train agent=q_learning env=four_rooms"),
         (
             ["env.slip=0.1", "seed=3"],
             "for stochastic worlds:",
-            "train.py agent=q_learning env.slip=0.1 seed=3",
+            "train agent=q_learning env.slip=0.1 seed=3",
         ),
-        (["env.num_rows=9"], "for large worlds:", "train.py agent=q_learning env.num_rows=9"),
+        (["env.num_rows=9"], "for large worlds:", "train agent=q_learning env.num_rows=9"),
     ],
 )
 def test_the_recipe_or_the_preset_comes_first(
@@ -32,7 +32,7 @@ def test_the_recipe_or_the_preset_comes_first(
     found = "\n".join(f"{line}" for line in _lines(tmp_path / "a run", "agent=q_learning", *words, *SHORT))
     assert reason in found
     assert command in found
-    assert f"diagnose.py {shlex.quote(str(tmp_path / 'a run'))}" in found
+    assert f"diagnose {shlex.quote(str(tmp_path / 'a run'))}" in found
 
 
 def _lines(folder: Path, *words: str) -> list[str]:

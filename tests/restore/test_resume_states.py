@@ -107,8 +107,8 @@ def ends(folder: Path, copied: Path, state: State) -> dict[str, Any] | None:
 
 
 RUNS = {
-    "dqn": [*SHORT["dqn"], "agent.learning_starts=100", "n_envs=32", "total_timesteps=1000"],
-    "ppo": [*SHORT["ppo"], "total_timesteps=1500"],
+    "dqn": [*SHORT["dqn"], "agent.learning_starts=100", "n_envs=32", "total_timesteps=800"],
+    "ppo": [*SHORT["ppo"], "total_timesteps=1100"],
     "q_learning": SHORT["q_learning"],
 }
 PLAIN = [

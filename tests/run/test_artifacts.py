@@ -11,18 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.resuming import begin, go_on
-from helpers.support import NO_FILES, SHORT, configure, script
+from helpers.support import NO_FILES, SHORT, script
 from stable_baselines3 import DQN
 
-from gridworld.agents.sb3.model_file import read_weights
 from gridworld.base.errors import InputError
 from gridworld.base.signals import Interrupted
 from gridworld.commands import evaluate, play, record
-from gridworld.envs.observations import make_observation
-from gridworld.run.reader import open_run
 from gridworld.training import session
 from gridworld.training.learning_curve import LearningCurve
-from gridworld.training.reproduce import compare
 from gridworld.training.saved_run import SavedRun
 
 # It is optimal on the way and no more at the end, at which it explores still.
@@ -69,19 +65,10 @@ def test_the_best_model_is_that_of_the_lowest_regret(kind: str, request: pytest.
     score = saved.evaluator().score(greedy)
     assert score.value == columns["value"][first]
     last = SavedRun(folder)
-    assert (last.steps(), last.snapshot().values.tolist()) != (
-        saved.steps(),
-        saved.snapshot().values.tolist(),
-    )
-
-
-def test_the_best_model_is_an_ordinary_file_of_sb3(deep: Path) -> None:
-    saved = SavedRun(deep, best=True)
-    model = DQN.load(deep / "best_model.zip", device="cpu")
-    assert model.num_timesteps == saved.steps()
-    actions, _ = model.predict(make_observation(saved.mdp, "one_hot").table(), deterministic=True)
-    assert np.array_equal(actions, saved.snapshot().greedy)
-    assert "policy.q_net.q_net.0.weight" in read_weights(deep / "best_model.zip", 10**8)
+    assert last.steps() != saved.steps()
+    assert last.snapshot().values.tolist() != saved.snapshot().values.tolist()
+    if kind == "deep":  # an ordinary file of SB3
+        assert DQN.load(folder / "best_model.zip", device="cpu").num_timesteps == saved.steps()
 
 
 def test_evaluations_as_sb3_writes_them(forgetful: Path) -> None:
@@ -108,15 +95,6 @@ def test_the_commands_take_the_best(
     assert (tmp_path / "best" / "policy.png").read_bytes() != (tmp_path / "last" / "policy.png").read_bytes()
     with pytest.raises(InputError, match=r"^--best: chooses between the models of a run; add --agent RUN$"):
         play.main(["--best"])
-
-
-def test_the_best_models_are_compared(forgetful: Path, tmp_path: Path) -> None:
-    config, mdp = configure(*FORGETFUL), SavedRun(forgetful).mdp
-    begin(tmp_path / "other", *FORGETFUL, "seed=1")
-    then, now = open_run(forgetful), open_run(tmp_path / "other")
-    same, other = ({each.part: each for each in compare(then, run, config, mdp)} for run in (then, now))
-    assert same["best weights"].same
-    assert not other["best weights"].same
 
 
 def log(folder: Path) -> list[str]:

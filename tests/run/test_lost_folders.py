@@ -21,10 +21,6 @@ from gridworld.training.together import run_alone
 LESS = ["recording.frames=false", "recording.gif=false", "logging.progress=false"]
 WORDS = [*SHORT["q_learning"], *LESS, "checkpoint.every=600"]
 TOLD = r"was deleted or replaced during the run, which stops here"
-POINTS: dict[str, tuple[Any, str]] = {
-    "after a checkpoint": (Checkpoints, "save"),
-    "while pictures are drawn": (Pictures, "finish"),
-}
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -40,14 +36,13 @@ def stranger(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("point", "is_job"),
-    [("after a checkpoint", False), ("while pictures are drawn", True)],
-    ids=["run", "job"],
+    ("owner", "name", "is_job"),
+    [(Checkpoints, "save", False), (Pictures, "finish", True)],
+    ids=["a run, after a checkpoint", "a job, while pictures are drawn"],
 )
 def test_a_run_that_lost_its_folder_leaves_the_new_one_alone(
-    point: str, is_job: bool, stranger: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    owner: Any, name: str, is_job: bool, stranger: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    owner, name = POINTS[point]
     original, folder = getattr(owner, name), tmp_path / "run"
 
     def then_taken_over(*arguments: Any, **options: Any) -> None:

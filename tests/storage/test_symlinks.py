@@ -27,6 +27,11 @@ def victim(tmp_path: Path) -> Path:
     return tmp_path / "victim"
 
 
+def link_to(target: Path, place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.symlink_to(target)
+
+
 def contents(folder: Path) -> dict[str, bytes | None]:
     return {str(path): path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
 
@@ -48,8 +53,7 @@ def test_a_link_below_is_not_gone_through(names: tuple[str, ...], tmp_path: Path
 
 @pytest.mark.parametrize("link", ["confirm", "confirm/default,00000000,seed=3"])
 def test_confirming_takes_no_folder_away_through_a_link(link: str, tmp_path: Path, victim: Path) -> None:
-    (tmp_path / "study" / link).parent.mkdir(parents=True)
-    (tmp_path / "study" / link).symlink_to(victim)
+    link_to(victim, tmp_path / "study" / link)
     before = contents(victim)
     run = confirm.HeldOutRun(tmp_path / "study" / "confirm" / "default,00000000,seed=3", configure())
     with pytest.raises(InputError, match=REFUSED):
@@ -61,8 +65,8 @@ def test_confirming_takes_no_folder_away_through_a_link(link: str, tmp_path: Pat
 
 def test_what_an_earlier_winner_left_goes_and_links_go_alone(tmp_path: Path, victim: Path) -> None:
     runs = tmp_path / "study" / "confirm"
-    (runs / "trial=2,11111111,seed=3").mkdir(parents=True)
-    (runs / "notes").mkdir()
+    for name in ("trial=2,11111111,seed=3", "notes"):
+        (runs / name).mkdir(parents=True)
     (runs / "trial=3,22222222,seed=3").symlink_to(victim)
     before = contents(victim)
     confirm.prepare(tmp_path / "study", [])
@@ -72,8 +76,7 @@ def test_what_an_earlier_winner_left_goes_and_links_go_alone(tmp_path: Path, vic
 
 @pytest.mark.parametrize("name", ["confirm", "experiment", "experiment/winner.yaml", "study.db"])
 def test_a_study_with_a_link_is_refused_before_anything(name: str, tmp_path: Path, victim: Path) -> None:
-    (tmp_path / "study" / name).parent.mkdir(parents=True)
-    (tmp_path / "study" / name).symlink_to(victim)
+    link_to(victim, tmp_path / "study" / name)
     with pytest.raises(InputError, match=f"study/{name}: {REFUSED}"):
         check_study_folder(tmp_path / "study")
 
@@ -85,9 +88,7 @@ def test_a_sweep_with_a_job_that_leads_elsewhere_is_refused(link: str, tmp_path:
     folder = SweepFolder(sweep)
     with folder.at_work():
         folder.add(jobs[:1], ["seed=0"])
-    place = sweep / "seed=0" / link
-    place.parent.mkdir(parents=True, exist_ok=True)
-    place.symlink_to(victim)
+    link_to(victim, sweep / "seed=0" / link)
     before = contents(victim)
     with pytest.raises(InputError, match=REFUSED):
         SweepFolder(sweep).check(jobs, extend=False)
@@ -98,8 +99,7 @@ def test_a_sweep_with_a_job_that_leads_elsewhere_is_refused(link: str, tmp_path:
 
 
 def test_hydra_writes_nothing_through_a_link(tmp_path: Path, victim: Path) -> None:
-    (tmp_path / "run" / ".hydra").mkdir(parents=True)
-    (tmp_path / "run" / ".hydra" / "config.yaml").symlink_to(victim / "trial=1,seed=0" / "model.zip")
+    link_to(victim / "trial=1,seed=0" / "model.zip", tmp_path / "run" / ".hydra" / "config.yaml")
     before = contents(tmp_path)
     done = script("train.py", *SHORT["sarsa"], "hydra.run.dir=run", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
@@ -108,15 +108,13 @@ def test_hydra_writes_nothing_through_a_link(tmp_path: Path, victim: Path) -> No
 
 
 def test_a_lock_or_checkpoints_that_are_a_link_are_refused(tmp_path: Path, victim: Path) -> None:
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / ".lock").symlink_to(victim / "trial=1,seed=0" / "model.zip")
+    link_to(victim / "trial=1,seed=0" / "model.zip", tmp_path / "run" / ".lock")
     before = contents(victim)
     with pytest.raises(InputError, match=rf"run/\.lock: {REFUSED}"), alone_in(tmp_path / "run"):
         pass
     with pytest.raises(InputError, match=r"run/\.lock: is a symbolic link"):
         is_locked(tmp_path / "run" / ".lock")
-    (tmp_path / "new").mkdir()
-    (tmp_path / "new" / "checkpoints").symlink_to(victim)
+    link_to(victim, tmp_path / "new" / "checkpoints")
     with pytest.raises(InputError, match=f"new/checkpoints: {REFUSED}"):
         check_free(tmp_path / "new")
     assert contents(victim) == before

@@ -56,26 +56,29 @@ def a_class(*names: str) -> list[str]:
 
 
 def test_a_small_sweep_comes_to_its_end_and_is_widened(cluster: Cluster, tmp_path: Path) -> None:
-    words = a_class("own.Broken", "stable_baselines3.A2C")
+    """A failure and a lost process take no other job along."""
     two_per_task = ["hydra.launcher.jobs_per_task=2"] if cluster.launcher == "slurm" else []
-    done = cluster.sweep(*words, *two_per_task, "seed=0,1", cwd=tmp_path)
+    words = a_class("own.Broken", "own.Killer", "stable_baselines3.A2C")
+    done = cluster.sweep(*words, *two_per_task, cwd=tmp_path)
     assert done.returncode == 1, done.stderr
-    rows = table(tmp_path / "sweep")
-    assert Counter(row["status"] for row in rows.values()) == {"done": 2, "failed": 2}
-    assert Counter(row["error"] for row in rows.values()) == {"RuntimeError: first second": 2, "": 2}
-    assert done.stderr.count("RuntimeError: first second") == 2
+    broken, killed, working = table(tmp_path / "sweep").values()
+    assert [row["status"] for row in (broken, killed, working)] == ["failed", "failed", "done"]
+    assert (broken["error"], working["error"]) == ("RuntimeError: first second", "")
+    assert killed["error"].startswith("its process died (")
+    assert done.stderr.count("RuntimeError: first second") == 1
     assert "Traceback" not in done.stderr
-    assert list((tmp_path / "sweep").glob(".slurm")) == []
     first = {path: path.read_bytes() for path in (tmp_path / "sweep").glob("*/manifest.json")}
-    assert len(first) == 4
+    assert len(first) == 3
 
     one_process = two_per_task or ["hydra.launcher.remote.num_cpus=2"]
-    widened = cluster.sweep(*words, *one_process, "seed=0,1,2", cwd=tmp_path)
-    assert "2 done, 2 failed; 2 to run" in widened.stderr
-    assert Counter(statuses(tmp_path / "sweep").values()) == {"done": 3, "failed": 3}
+    words = (*a_class("own.Broken", "stable_baselines3.A2C"), "seed=0,1")
+    widened = cluster.sweep(*words, *one_process, cwd=tmp_path)
+    assert "1 done, 1 failed; 2 to run" in widened.stderr
+    assert Counter(statuses(tmp_path / "sweep").values()) == {"done": 2, "failed": 3}
     assert all(path.read_bytes() == content for path, content in first.items())
+    assert list((tmp_path / "sweep").glob(".slurm")) == []
 
-    here = [word for word in cluster.words(*words, "seed=0,1,2") if "launcher" not in word]
+    here = [word for word in cluster.words(*words) if "launcher" not in word]
     assert "0 to run" in script("train.py", *here, cwd=tmp_path).stderr  # they are the same jobs
 
 
@@ -95,14 +98,6 @@ def test_a_signal_gives_its_tasks_up(cluster: Cluster, tmp_path: Path) -> None:
     assert set(found.values()) <= {"interrupted", "pending"}
     if cluster.launcher == "slurm":
         assert cluster.slurms("squeue", "--noheader", "--states=PENDING,RUNNING") == ""
-
-
-def test_a_lost_process_is_told_and_takes_no_other_job_along(cluster: Cluster, tmp_path: Path) -> None:
-    done = cluster.sweep(*a_class("own.Killer", "stable_baselines3.A2C"), cwd=tmp_path)
-    assert done.returncode == 1, done.stderr
-    rows = list(table(tmp_path / "sweep").values())
-    assert [row["status"] for row in rows] == ["failed", "done"]
-    assert rows[0]["error"].startswith("its process died (")
 
 
 def test_no_job_begins_after_the_first_failure_if_asked(cluster: Cluster, tmp_path: Path) -> None:

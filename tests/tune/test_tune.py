@@ -8,7 +8,6 @@ import shutil
 import signal
 import sqlite3
 import sys
-from functools import partial
 from pathlib import Path
 
 import optuna
@@ -68,17 +67,15 @@ def test_a_search_leaves_a_row_per_trial_and_a_verdict(studied: Path) -> None:
     assert seeds == ["seed=3", "seed=4"]
 
 
-@pytest.mark.parametrize(
-    "words", [["recipe=study"], ["--config-dir", "study/experiment/..", "experiment=winner"]]
-)
-def test_its_winner_is_a_recipe_of_train_py(words: list[str], studied: Path) -> None:
-    done = script("train.py", *words, "--cfg", "job", cwd=studied)
-    assert done.returncode == 0, done.stderr
-    config = yaml.safe_load(done.stdout)
+def test_its_winner_is_a_recipe_of_train_py(studied: Path) -> None:
     winner = json.loads((studied / "study" / "study.json").read_text())["winner"]
-    for key, value in winner["values"].items():
-        assert config["agent"][key.removeprefix("agent.")] == value, key
-    assert config["total_timesteps"] == 1500
+    for words in (["recipe=study"], ["--config-dir", "study/experiment/..", "experiment=winner"]):
+        done = script("train.py", *words, "--cfg", "job", cwd=studied)
+        assert done.returncode == 0, done.stderr
+        config = yaml.safe_load(done.stdout)
+        for key, value in winner["values"].items():
+            assert config["agent"][key.removeprefix("agent.")] == value, key
+        assert config["total_timesteps"] == 1500
 
 
 def test_the_same_line_goes_on_with_the_study(studied: Path) -> None:
@@ -119,21 +116,19 @@ def test_the_report_shows_the_study(studied: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (["tune=narrow"], "was started with another search space: agent.exploration_final_eps was"),
-        (["agent.gamma=0.8"], "was started with another configuration: agent.gamma was 0.9, now it is 0.8"),
-        (["tune.seeds=3"], "was started with another objective: seeds was [0, 1], now it is [0, 1, 2]"),
+        ("tune=narrow", "was started with another search space: agent.exploration_final_eps was"),
+        ("agent.gamma=0.8", "was started with another configuration: agent.gamma was 0.9, now it is 0.8"),
+        ("tune.seeds=3", "was started with another objective: seeds was [0, 1], now it is [0, 1, 2]"),
     ],
 )
 def test_a_study_of_another_search_is_refused(
-    studied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: list[str], sentence: str
+    studied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: str, sentence: str
 ) -> None:
-    own = tmp_path / "tune"
-    own.mkdir()
-    (own / "narrow.yaml").write_text(
-        "# @package tune.space\nagent.learning_rate: {type: float, low: 0.1, high: 0.9}\n"
-    )
+    (tmp_path / "tune").mkdir()
+    space = "# @package tune.space\nagent.learning_rate: {type: float, low: 0.1, high: 0.9}\n"
+    (tmp_path / "tune" / "narrow.yaml").write_text(space)
     before = (studied / "study" / "trials.csv").read_bytes()
-    assert sentence in refusal(monkeypatch, studied, *QUICK, *more, "--config-dir", str(tmp_path))
+    assert sentence in refusal(monkeypatch, studied, *QUICK, more, "--config-dir", str(tmp_path))
     assert (studied / "study" / "trials.csv").read_bytes() == before
 
 
@@ -285,18 +280,18 @@ def test_a_search_of_one_worker_is_the_same_however_it_is_killed(tmp_path: Path)
         study = json.loads((folder / "study" / "study.json").read_text())
         return found, (study["winner"]["values"], study["confirmation"])
 
-    def has_ended(folder: Path, trials: int) -> bool:
+    def has_ended_a_trial(folder: Path) -> bool:
         file = folder / "study" / "study.db"
         with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(file)) as study:
-            return len(study.execute("SELECT * FROM trials").fetchall()) >= trials
+            return len(study.execute("SELECT * FROM trials").fetchall()) > 0
         return False
 
-    for name, kills in (("calm", 0), ("killed", 2)):
+    for name in ("calm", "killed"):
         folder = tmp_path / name
         folder.mkdir()
-        for ended in range(kills):
+        if name == "killed":
             with start("tune.py", *words, cwd=folder) as process:
-                wait_for(partial(has_ended, folder, ended), "a trial", process)
+                wait_for(lambda: has_ended_a_trial(tmp_path / "killed"), "a trial", process)
                 worker = wait_for_workers(process, 1)[0]
                 os.kill(worker, signal.SIGKILL)
                 workers = wait_for_workers(process, 1, but=worker)

@@ -1,15 +1,19 @@
 """Pictures of worlds that are no maps: panels, other actions, states without a place, foreign frames."""
 
 import dataclasses
+import itertools
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
+from gridworld.base.errors import InputError
 from gridworld.config.train import PICTURES, TrainConfig
 from gridworld.config.worlds import EnvConfig, GymnasiumConfig
 from gridworld.envs.rendering import (
@@ -29,7 +33,7 @@ from gridworld.envs.rollout import Episode, play
 from gridworld.visualization import episode
 from gridworld.visualization.animation import Animation, animation_of_rendered
 from gridworld.visualization.canvas import Canvas, directions, moving_actions
-from gridworld.visualization.episode import film
+from gridworld.visualization.episode import film, rendered_frames
 from gridworld.visualization.files import save
 from gridworld.visualization.maps import draw_error_map, draw_policy_map, policy, visits
 from gridworld.visualization.picture import PolicyHistory, Subject, drawer
@@ -41,6 +45,7 @@ from gridworld.world.layout import load
 from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.solver import value_iteration
+from gridworld.world.sources.enumerated import enumerate_env
 
 DIRECTIONS = {"up": (-1, 0), "right": (0, 1), "down": (1, 0), "left": (0, -1)}
 DIRECTIONS |= {"north": (-1, 0), "east": (0, 1), "south": (1, 0), "west": (0, -1)}
@@ -275,3 +280,73 @@ def test_foreign_frames_of_few_colours_stay_exact() -> None:
     shown = animation_of_rendered(frames, [1, 0, 1])
     colours = [tuple(np.asarray(shown.draw(key).convert("RGB"))[0, 0]) for key in shown.keys]
     assert colours == [TRAP, AGENT, TRAP]
+
+
+# ---- frames of an episode, rendered by the environment that a world was made from --------------------------
+
+
+def frames_of(env_id: str, states: list[int], mdp: Mdp | None = None, most_pixels: int = 512 * 512, **kwargs):
+    config = GymnasiumConfig(id=env_id, kwargs=kwargs)
+    return rendered_frames(config, mdp or config.compile(), [states], most_pixels)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "states", "size"),
+    [
+        ("FrozenLake-v1", [0, 4, 8, 4], (256, 256)),
+        ("CliffWalking-v1", [36, 24, 25, 24], (256, 768)),
+        ("Taxi-v4", [1, 101, 201, 101], (456, 536)),
+    ],
+)
+def test_an_environment_with_a_table_is_put_into_each_state(env_id, states, size):
+    before = dict(os.environ)
+    frames = frames_of(env_id, states)
+    assert [frame.shape for frame in frames] == [(*size, 3)] * 4
+    assert frames[0].dtype == np.uint8
+    assert np.array_equal(frames[1], frames[3])
+    changed = [(one != other).any(axis=2) for one, other in itertools.pairwise(frames)]
+    assert all(0 < each.mean() < 0.15 for each in changed)  # the agent, and no more
+    assert {name: value for name, value in os.environ.items() if "SDL" in name} == {
+        name: value for name, value in before.items() if "SDL" in name
+    }
+
+
+def test_an_enumerated_environment_takes_the_same_walk():
+    name, short = "MiniGrid-Empty-5x5-v0", {"max_steps": 12}
+    mdp = enumerate_env(name, short)
+    env = gym.make(name, render_mode="rgb_array", **short)
+    env.reset(seed=5)
+    states, expected = [int(mdp.start_states[0])], [env.render()]
+    for action in (2, 1, 5, 2, 0, 0, 1, 2, 2):
+        env.step(action)
+        states.append(int(mdp.next_state[states[-1], action, 0]))
+        expected.append(env.render())
+    env.close()
+    assert np.array_equal(frames_of(name, states, mdp, **short), expected)
+    assert {*mdp.panel_names} == {f"facing {way}" for way in ("right", "down", "left", "up")}
+    assert mdp.places is not None
+    assert mdp.places.max(axis=0).tolist() == [3, 2, 2]  # 3 x 3 cells, once for each direction
+    facing_right = (mdp.places == 0).all(axis=1)  # at the start, at all steps from 0 to 12
+    assert (board_of(mdp).summed(np.ones(mdp.num_states))[facing_right] == facing_right.sum()).all()
+    assert facing_right.sum() > 2
+    with pytest.raises(
+        InputError, match="no action leads from row 2, column 2, facing right, step 0 to row 2, column 2"
+    ):
+        frames_of(name, [0, 0], mdp, **short)
+
+
+def test_large_frames_are_made_smaller():
+    frame, *_ = frames_of("CliffWalking-v1", [36], most_pixels=30_000)
+    assert frame.shape == (100, 300, 3)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "words"),
+    [
+        ("NoSuchWorld-v0", "is not registered with Gymnasium .*doesn't exist"),
+        *((name, r"cannot be rendered: [^\n]*$") for name in ("Pendulum-v1", "CartPole-v1", "Blackjack-v1")),
+    ],
+)
+def test_what_cannot_be_rendered_is_one_sentence(env_id, words):
+    with pytest.raises(InputError, match=f"^env.id={env_id}: {words}"):
+        frames_of(env_id, [0, 4, 8], FROZEN_LAKE)

@@ -18,6 +18,7 @@ from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 from gridworld.world.solver import value_iteration
+from gridworld.world.sources.arrays import mdp_from_arrays
 
 SLIPS = [Fraction(0), Fraction(1, 10), Fraction(1, 1000), Fraction(1, 10**7), Fraction(1)]
 TINY = Fraction(1, 10**120)  # 1 - γ: a value V differs by V' TINY, an infinite loss is about -1 / TINY
@@ -206,3 +207,21 @@ def test_what_hardly_shows_in_a_value_still_decides(rows, slip, step, goal, trap
 def test_a_discount_that_rounding_hides_is_refused(gamma):
     with pytest.raises(InputError, match="so close to 1 that rounding hides"):
         value_iteration(compile_mdp(load("classic")), gamma)
+
+
+@pytest.mark.parametrize("dense", [512, 0])
+def test_a_way_to_rest_for_ever_is_worth_what_it_costs(dense, monkeypatch):
+    """Waiting costs 1 a step and leads to rest with probability 1/2: it costs 2, not infinitely much."""
+    monkeypatch.setattr("gridworld.world.chain.DENSE_STATES", dense)
+    next_state = np.array([[[0, 1], [2, 2]], [[1, 1], [1, 1]], [[2, 2], [2, 2]]])
+    ends = np.zeros((3, 2, 2), dtype=bool)
+    ends[0, 1] = ends[2] = True
+    tables = {
+        "next_state": next_state,
+        "probability": np.full((3, 2, 2), 0.5),
+        "reward": np.array([[[-1.0, -1.0], [-5.0, -5.0]], *[[[0.0, 0.0], [0.0, 0.0]]] * 2]),
+        "terminated": ends,
+        "start": np.array([1.0, 0.0, 0.0]),
+    }
+    mdp = mdp_from_arrays("rest", tables, "rest")
+    assert value_iteration(mdp, 1.0).v.tolist() == [-2.0, 0.0, 0.0]

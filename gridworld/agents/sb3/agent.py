@@ -230,7 +230,7 @@ class EngineAgent(SB3Agent):
 
     @property
     def model(self) -> BaseAlgorithm:
-        """SB3's own object, with what was learnt so far; it can learn on, unless it is only asked."""
+        """SB3's own object, with what was learned so far; it can learn on, unless it is only asked."""
         if self._is_only_asked:
             put_weights(self.run)
             return self._model

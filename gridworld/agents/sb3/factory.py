@@ -221,4 +221,5 @@ def _make(where: str, value: Any, kind: type = object) -> Any:
     try:
         return found(**arguments)
     except Exception as error:  # the class may be anybody's
-        raise InputError(f"{where}: {value[_TARGET]} cannot be built: {in_short(error)}") from error
+        hint = "; logging.wandb=true calls it" if "wandb.init" in str(error) else ""
+        raise InputError(f"{where}: {value[_TARGET]} cannot be built: {in_short(error)}{hint}") from error

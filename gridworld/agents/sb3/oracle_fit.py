@@ -33,7 +33,7 @@ def oracle_fit(
     """Whether greedy actions become optimal where a copy of a model's network is fitted to the optimum.
 
     `best` is the optimum under the agent's own discount, `states` (n,) are those that an episode can come to,
-    `is_optimal` judges greedy actions (S,), and `fresh` weights are not those that the model has learnt.
+    `is_optimal` judges greedy actions (S,), and `fresh` weights are not those that the model has learned.
     """
     fit = _Fit(agent, best, states, advantages=True)
     actions = np.argmax(best.q, axis=1)

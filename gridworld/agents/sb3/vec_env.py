@@ -113,7 +113,7 @@ class GridWorldVecEnv(VecEnv):
 
 
 def make_vec_env(
-    env: str | Mdp | Layout | PathLike[str] = CLASSIC,
+    env: str | Mdp | Layout | PathLike[str] | None = None,
     n_envs: int = 64,
     observation: str = "one_hot",
     seed: int | None = 0,
@@ -125,6 +125,7 @@ def make_vec_env(
     Args:
         env: what `env=NAME` means on a command line (`classic`, `cliff`, `taxi_v4`, ...) or an id of
             Gymnasium; a compiled world; or a map, its file or a `Layout`. `layout=NAME` is the bare map.
+            None: `classic`.
         n_envs: how many environments step together.
         observation: `one_hot`, `coordinates`, `image` (for CnnPolicy), `own` or `none` (the state's number).
         seed: of the starts and slips, unless the model has a seed, which SB3 gives to its environments; None:
@@ -143,7 +144,12 @@ def make_vec_env(
         >>> from stable_baselines3 import PPO
         >>> model = PPO("MlpPolicy", make_vec_env("four_rooms", n_envs=8, slip=0.1))
     """
-    if not {"layout", "mdp"} & set(world):
+    if described := {"layout", "mdp"} & set(world):
+        if env is not None:
+            named = [f"env={str(env)[:50]}", *(f"{key}={str(world[key])[:50]}" for key in sorted(described))]
+            raise InputError(f"{', '.join(named)}: are {len(named)} worlds; name one of them")
+    else:
+        env = CLASSIC if env is None else env
         if isinstance(env, str):
             settings = {name: world.pop(name) for name in set(world) - _OF_A_BATCH}
             world["mdp"] = named_world(env, **settings)

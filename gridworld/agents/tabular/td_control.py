@@ -96,7 +96,7 @@ class TabularAgent(Agent):
 
     @abstractmethod
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What it has learnt, by names."""
+        """What it has learned, by names."""
 
     def model_file(self) -> bytes:
         return npz_bytes({"algorithm": np.array(self.config.algorithm), **self.arrays()})

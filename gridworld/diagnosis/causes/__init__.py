@@ -29,7 +29,7 @@ PHRASES = {  # by name
     "epsilon": "plays safe for epsilon",
     "network": "network cannot hold it",
     "scale": "rewards scaled badly",
-    "forgetting": "forgets what it learnt",
+    "forgetting": "forgets what it learned",
     "entropy": "entropy bonus too large",
     "rate": "updates too large",
     "exploration": "too little exploration",

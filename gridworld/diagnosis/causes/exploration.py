@@ -19,7 +19,7 @@ _LEFT = 0.2  # of how often the first policy met the goal
 
 
 def not_tried(run: Evidence) -> Finding | None:
-    """One that had learnt everything from the actions tried could not do much better."""
+    """One that had learned everything from the actions tried could not do much better."""
     ahead = best_of_what_was_tried(run.evaluator, run.visits >= (_FEWEST if run.is_actor_critic else 1))
     best, ours = run.evaluator.solution, Chain(run.mdp, run.snapshot.greedy_policy())
     with np.errstate(invalid="ignore"):

@@ -59,7 +59,7 @@ def diverged(run: Evidence) -> Finding | None:
 
 
 def scaled(run: Evidence) -> Finding | None:
-    """Its `reward_scale` makes the values to be learnt far from those of an untrained network."""
+    """Its `reward_scale` makes the values to be learned far from those of an untrained network."""
     if run.is_tabular or not run.takes("reward_scale"):
         return None
     scale, largest = run.setting("reward_scale", 1.0), float(np.abs(run.own.v[run.mdp.acting]).max())

@@ -116,6 +116,7 @@ class HeldOutRun:
 
     folder: Path
     config: TrainConfig
+    words: list[str]  # of a command line that gives these settings
 
 
 def run_held_out(runs: Sequence[HeldOutRun]) -> None:
@@ -128,12 +129,14 @@ def run_held_out(runs: Sequence[HeldOutRun]) -> None:
 def _training(run: HeldOutRun) -> Training[None]:
     inside(run.folder.parents[1], CONFIRM, run.folder.name).mkdir(parents=True, exist_ok=True)
     try:
-        yield from run_in_sweep(run.config, run.folder, [], stop_at_failure=False)
+        yield from run_in_sweep(run.config, run.folder, run.words, stop_at_failure=False)
     except JobError as error:
         tell(f"{run.folder}: {error}")
 
 
-def held_out_runs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[int]) -> list[HeldOutRun]:
+def held_out_runs(
+    folder: Path, name: str, config: TrainConfig, seeds: Sequence[int], words: Sequence[str]
+) -> list[HeldOutRun]:
     """A run of a configuration on each seed; only the first ones write event files.
 
     A run's folder has a hash of its settings in its name: other settings are other runs.
@@ -144,7 +147,8 @@ def held_out_runs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[
         logging = config.logging if len(runs) < _IN_TENSORBOARD else silent
         of_seed = dataclasses.replace(config, seed=seed, logging=logging)
         digest = settings_hash(dataclasses.asdict(of_seed), world)[:_HASH_SHOWN]
-        runs.append(HeldOutRun(folder / CONFIRM / f"{name},{digest},seed={seed}", of_seed))
+        place = folder / CONFIRM / f"{name},{digest},seed={seed}"
+        runs.append(HeldOutRun(place, of_seed, [*words, f"seed={seed}"]))
     return runs
 
 

@@ -285,7 +285,7 @@ class Search:
         if self._settings.pruner == "hyperband":
             most = reports * self._settings.seeds
             return optuna.pruners.HyperbandPruner(min_resource=reports, max_resource=most)
-        # Half a seed's budget is given to everybody: until then most have learnt nothing yet.
+        # Half a seed's budget is given to everybody: until then most have learned nothing yet.
         return optuna.pruners.MedianPruner(n_warmup_steps=reports // 2)
 
 

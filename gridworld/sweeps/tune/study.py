@@ -43,13 +43,13 @@ from gridworld.base.safe_read import LARGEST_CSV, file_sha256, read_sealed, seal
 from gridworld.base.signals import Interrupted, exiting
 from gridworld.config.compose import compose_run, search_path
 from gridworld.config.fields import Effect
-from gridworld.config.recipe_file import IN_A_STUDY, TRUST, overrides
+from gridworld.config.recipe_file import IN_A_STUDY, TRUST, literal, overrides
 from gridworld.config.settings import ON_RESULT, flat, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import conf_folder
 from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.report.writer import write_over_seeds
-from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, check_writable, claimed, shell_path
+from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, check_writable, claimed, shell_path, shown
 from gridworld.run.provenance import versions
 from gridworld.sweeps.plan import may_fork
 from gridworld.sweeps.tune.confirmation import (
@@ -130,8 +130,12 @@ def _conclude(
     is_new = before != best.params
     tuned = _tuned(spec.base, values) if is_new else spec.base
     measured, name = spec.objective.base, f"trial={best.number}"
-    winner = held_out_runs(spec.folder, name, _tuned(measured, values), spec.held_out) if is_new else []
-    began_from = held_out_runs(spec.folder, "default", measured, spec.held_out)
+    began_from = held_out_runs(spec.folder, "default", measured, spec.held_out, spec.words)
+    words = [word for word in spec.words if word.lstrip("+").partition("=")[0] not in values]
+    words += [f"++{key}={literal(each, key)}" for key, each in values.items()]
+    winner = (
+        held_out_runs(spec.folder, name, _tuned(measured, values), spec.held_out, words) if is_new else []
+    )
     confirmed = _confirm(spec, winner, began_from, workers)
     about = f"the best of {len(study.trials)} trials; study.json has the results"
     recipe = write_recipe(spec.folder, spec.conf, spec.choices, tuned, about)
@@ -157,7 +161,7 @@ def _conclude(
 
 def _words_for(recipe: Path, spec: StudySpec) -> str:
     """What train.py needs with the recipe: the user's own folders, and trust in the user's own classes."""
-    words = search_path(spec.conf)
+    words = [f"--config-dir={shown(folder)}" for folder in spec.conf]
     try:
         overrides(recipe)
     except InputError:

@@ -70,6 +70,7 @@ class StudySpec:
     conf: tuple[Path, ...]  # the user's own folders of yaml files, which are searched after `conf/`
     base: TrainConfig  # the configuration that the search begins from
     choices: dict[str, str]  # of CHOSEN
+    words: list[str]  # of a command line that gives the base, but for the seed
     settings: TuneConfig  # without null where a default follows from the rest
     space: SearchSpace
 
@@ -128,7 +129,9 @@ def compose_study(words: Sequence[str], conf: tuple[Path, ...] = ()) -> StudySpe
     settings = _completed(settings, choices["agent"], base)
     space = SearchSpace(settings.space, space_name)
     space.check(base, check_settings(base))
-    spec = StudySpec(conf, base, choices, settings, space)
+    words = [f"{group}={choice}" for group, choice in choices.items()]
+    words += [word for word in of_run if word.partition("=")[0] not in (*CHOSEN, "seed")]
+    spec = StudySpec(conf, base, choices, words, settings, space)
     if spec.held_out.stop > _LARGEST_SEED:
         raise InputError(f"seed={base.seed}: leaves no room for the seeds after it, below 2**32")
     return spec
@@ -257,7 +260,7 @@ def _distribution(key: str, dimension: DimensionConfig) -> BaseDistribution:
     if (effect := effect_of(key)) in _GIVEN:
         raise InputError(f"{key}: is part of the task, so it cannot be searched")
     if effect is not Effect.LEARNING:
-        raise InputError(f"{key}: does not affect what is learnt, so it cannot be searched")
+        raise InputError(f"{key}: does not affect what is learned, so it cannot be searched")
     if kind == "categorical":
         if not choices or len(set(map(json.dumps, choices))) < len(choices):
             raise InputError(f"{key}: type=categorical needs choices, a list of different values")

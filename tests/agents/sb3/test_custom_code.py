@@ -1,27 +1,29 @@
-"""Custom algorithms, layers, optimisers, buffers and callbacks in SB3's own loop.
+"""Custom algorithms, layers, optimisers, buffers and callbacks in SB3's own loop, by code or by yaml alone.
 
-Those that say what they keep go on to the bit; with others a run trains without checkpoints.
+Those that say what they keep go on to the bit; with others a run trains without checkpoints. Mistakes that
+are found before anything is built are in commands/bad_input.txt.
 """
 
 import importlib
 import json
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.own_class import any_class
+from helpers.own_class import OWN_CLASS, any_class, importable
 from helpers.resuming import begin, differences, go_on, left_behind, rows, stopped_after
-from helpers.support import SHORT, configure
+from helpers.support import NO_FILES, SHORT, configure, script
 
 from gridworld.agents.sb3.model_file import read_weights
 from gridworld.base.errors import InputError
-from gridworld.config.recipe_file import overrides
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.reader import check_free, read_run
 from gridworld.training.resume import open_unfinished
 from gridworld.training.saved_run import SavedRun, settings_of
+from gridworld.training.train import train
 
 MODULE = """
 import numpy as np
@@ -68,10 +70,6 @@ class Recording(BaseCallback):
         return self.num_timesteps < 300
     def _on_training_end(self):
         CALLS.append("end")
-
-class Failing(Recording):
-    def __init__(self):
-        raise RuntimeError("no server")
 
 class Counting:  # changes learning by what it has counted, and draws numbers of its own
     def __init__(self, *arguments, **options):
@@ -221,7 +219,7 @@ def test_callbacks_of_sb3_may_hold_others(tmp_path: Path) -> None:
 
 
 def test_callbacks_of_a_strangers_run_write_nothing_without_trust(tmp_path: Path) -> None:
-    """Stable-Baselines3's own write files where they are told to, and make what they hold."""
+    """Stable-Baselines3's own write files where they are told to; those of recipes: config/test_fields.py."""
     made = tmp_path / "made.json"
     held = {"_target_": "stable_baselines3.common.logger.JSONOutputFormat", "filename": str(made)}
     begin(tmp_path / "run", *SHORT["a2c"], *LESS)
@@ -229,36 +227,91 @@ def test_callbacks_of_a_strangers_run_write_nothing_without_trust(tmp_path: Path
     run.manifest["config"]["callbacks"] = [held]
     with pytest.raises(InputError, match="may write files; add "):
         settings_of(run)
-    recipe = tmp_path / "recipe.yaml"
-    recipe.write_text(f"callbacks: {json.dumps([held])}")
-    with pytest.raises(InputError, match="may write files; add trust=true"):
-        overrides(recipe)
     assert not made.exists()
 
 
-OWN = "{_target_: own_code."
+# ---- any class with SB3's interface, by yaml alone ---------------------------------------------------------
+
+OWN_YAML = """# @package _global_
+# an agent of my own
+defaults:
+  - /agent/schema/sb3@agent
+  - _self_
+
+total_timesteps: 500
+n_envs: 4
+agent:
+  name: mine
+  algorithm: my_agents.Mine
+  arguments: {caution: 0.7, gamma: 0.9}
+"""
+
+
+def test_ones_own_class_in_ones_own_yaml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_agents.py").write_text(OWN_CLASS)
+    (tmp_path / "my_conf" / "agent").mkdir(parents=True)
+    (tmp_path / "my_conf" / "agent" / "mine.yaml").write_text(OWN_YAML)
+    words = ("--config-dir", "my_conf", "agent=mine", "hydra.run.dir=out", "agent.arguments.caution=0.9")
+    done = script("train.py", *words, cwd=tmp_path, PYTHONPATH=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert "mine on classic, seed 0: 500 steps" in done.stdout
+    settings = json.loads((tmp_path / "out" / "manifest.json").read_text())["config"]["agent"]
+    assert settings["arguments"] == {"caution": 0.9, "gamma": 0.9}
+
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match=r"algorithm=my_agents\.Mine is not from one of"):
+        SavedRun(tmp_path / "out").snapshot()
+    assert SavedRun(tmp_path / "out", trust=True).snapshot().greedy.shape == (30,)
+
+
+def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "sb3_contrib", None)
+    with pytest.raises(
+        InputError, match=r"agent\.algorithm=sb3_contrib\.QRDQN: needs sb3-contrib; pip install"
+    ):
+        train(configure(*SHORT["qrdqn"]), tmp_path, [])
+
+
+def outcome(folder: Path, *words: str) -> str:
+    """What a run says that makes an update or two; nothing where it says nothing."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            train(configure(*words, *NO_FILES), folder, [])
+        except InputError as error:
+            return str(error)
+    return ""
 
 
 @pytest.mark.parametrize(
-    ("callbacks", "told"),
+    ("agent", "word", "sentence"),
     [
-        ("[3]", r"callbacks\[0\]=3: must be a mapping of _target_"),
-        ("[{every: 3}]", r"callbacks\[0\]={'every': 3}: must be a mapping of _target_"),
-        ("[{_target_: Stirring}]", "must be a mapping of _target_, the import path"),
-        (f"[{OWN}Stiring}}]", r"callbacks\[0\]\._target_=own_code\.Stiring: must be the import path of"),
-        ("[{_target_: torch.nn.ReLU}]", "must be the import path of a BaseCallback class"),
-        ("[{_target_: nowhere.Stirring}]", "no module nowhere; is its folder"),
-        (f"[{OWN}Stirring, every: 3, evry: 3}}]", "got an unexpected keyword argument 'evry'"),
-        (f"[{OWN}Failing}}]", r"callbacks\[0\]: own_code\.Failing cannot be built: .*no server"),
+        (
+            "dqn",
+            "agent.policy_kwargs.activation_fn=torch.nn.Module",
+            "agent=dqn: DQN cannot be evaluated: NotImplementedError: Module [Module] is missing the "
+            'required "forward" function; check agent.policy_kwargs.activation_fn=torch.nn.Module',
+        ),
+        ("dqn", "agent.policy_kwargs.activation_fn=torch.nn.ModuleList", "torch.nn.ModuleList"),
+        ("dqn", "agent.policy_kwargs.activation_fn=torch.nn.Dropout", ""),
+        ("a2c", "+agent.arguments.policy_kwargs.optimizer_class=torch.optim.LBFGS", "torch.optim.LBFGS"),
+        ("a2c", "+agent.arguments.policy_kwargs.optimizer_class=torch.optim.Adafactor", ""),
+        ("ppo", "agent.learning_rate=1e307", "training diverged at update"),
+        ("dqn", "agent.policy_kwargs.activation_fn=own_modules.Drawn", "DQN does not always answer the same"),
+        (
+            "a2c",
+            f"{LAYER}own_modules.Among",
+            "agent=a2c: stable_baselines3.A2C does not always answer the same",
+        ),
     ],
 )
-def test_mistakes_are_found_before_training(callbacks: str, told: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=told):
-        begin(tmp_path / "run", *SHORT["a2c"], f"callbacks={callbacks}")
-    assert not list((tmp_path / "run").iterdir())
-
-
-def test_a_tabular_agent_has_none() -> None:
-    config = configure("agent=sarsa", STIRRING)
-    with pytest.raises(InputError, match=r"^callbacks: agent=sarsa does not call Stable-Baselines3's"):
-        config.agent.check(config)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_what_only_the_class_can_judge_is_refused_in_a_sentence(
+    agent: str, word: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    importable(tmp_path / "modules", monkeypatch)
+    (tmp_path / "run").mkdir()
+    told = outcome(tmp_path / "run", *SHORT[agent], word)
+    assert sentence in told
+    assert bool(sentence) == bool(told)
+    assert "\n" not in told

@@ -1,15 +1,12 @@
-"""Features extractors: what they make of coordinates and of images, and that a network learns from pixels."""
+"""Features extractors: what they make of coordinates and of images."""
 
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from helpers.support import NO_FILES, SHORT, train_in
-from stable_baselines3 import PPO
 from torch import Tensor
 
 import gridworld
@@ -111,13 +108,3 @@ def test_what_they_cannot_take(kind: Any, arguments: list[Any], words: str) -> N
     with pytest.raises(InputError) as mistake:
         kind(*arguments)
     assert words in str(mistake.value)
-
-
-def test_a_runs_model_loads_in_plain_sb3(tmp_path: Path) -> None:
-    words = (*SHORT["ppo"], "n_envs=8", "observation=coordinates", *NO_FILES)
-    summary = train_in(tmp_path, *words)
-    model = PPO.load(tmp_path / "model.zip", device="cpu")
-    assert any(isinstance(each, FourierFeatures) for each in model.policy.modules())
-    assert gridworld.evaluate(model, "classic").regret == pytest.approx(summary["regret"], abs=1e-9)
-    model.set_env(gridworld.make_vec_env(observation="coordinates", n_envs=8))
-    model.learn(64)

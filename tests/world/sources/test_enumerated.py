@@ -111,7 +111,8 @@ class Corridor(gym.Env[Any, int]):
 
 @pytest.fixture(scope="module", autouse=True)
 def _registered() -> Any:
-    gym.register("Corridor-v0", entry_point=Corridor)
+    for kind in (Corridor, Counted, Ferry):
+        gym.register(f"{kind.__name__}-v0", entry_point=kind)
     gym.register("ShortCorridor-v0", entry_point=Corridor, max_episode_steps=12)
     gym.register(
         "DoubledCorridor-v0",
@@ -123,8 +124,8 @@ def _registered() -> Any:
         ),
     )
     yield
-    for name in ("Corridor-v0", "ShortCorridor-v0", "DoubledCorridor-v0"):
-        del gym.registry[name]
+    for name in ("Corridor", "Counted", "Ferry", "ShortCorridor", "DoubledCorridor"):
+        del gym.registry[f"{name}-v0"]
 
 
 @pytest.fixture(scope="module")
@@ -325,11 +326,9 @@ class Counted(Corridor):
 
 
 def test_what_changes_with_every_episode_is_named() -> None:
-    gym.register("Counted-v0", entry_point=Counted)
     with pytest.raises(InputError, match=r"the same state \(in episodes\).*env.ignore"):
         enumerate_env("Counted-v0", {"limit": 9})
     assert enumerate_env("Counted-v0", {"limit": 9}, ignore=["episodes", "steps"]).num_states == CELLS
-    del gym.registry["Counted-v0"]
 
 
 class Ferry(gym.Env[Any, int]):
@@ -365,7 +364,6 @@ class Ferry(gym.Env[Any, int]):
     ("cells", "first", "last"), [(4, 3, 3), (4, 5, 9), (11, 11, 11), (4, 13, 14), (11, 19, 19), (4, 20, 30)]
 )
 def test_what_is_there_for_a_time_only(cells: int, first: int, last: int) -> None:
-    gym.register("Ferry-v0", entry_point=Ferry)
     kwargs = {"cells": cells, "first": first, "last": last}
     mdp = enumerate_env("Ferry-v0", kwargs)
     boarded = max(cells, first)
@@ -374,7 +372,6 @@ def test_what_is_there_for_a_time_only(cells: int, first: int, last: int) -> Non
     if truth:
         with pytest.raises(InputError, match=r"env.ignore leaves out"):
             enumerate_env("Ferry-v0", kwargs, ignore=["clock"])
-    del gym.registry["Ferry-v0"]
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,103 @@
+"""How Lab 1 is marked: by the exact solver, on worlds that the sheet does not show."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from gridworld import Evaluator, Mdp, compile_mdp
+from gridworld.grading import Work, WrongAnswerError, exercise
+from gridworld.world.chain import Chain
+from gridworld.world.layout import parse
+from gridworld.world.solver import backup, solved
+
+MAPS = {
+    "a room": "S..T\n.#..\n...G\n",
+    "two goals": "S.T.G\n.#.#.\n..T..\nG...S\n",
+    "a cliff": ".....\n.....\nSCCCG\n",
+}
+TOLERANCE = 1e-6
+
+
+def worlds() -> Iterator[tuple[str, Mdp, float]]:
+    """Worlds with a description and a discount."""
+    for (name, text), slip, gamma in zip(MAPS.items(), (0.0, 0.3, 0.1), (0.9, 0.97, 0.6), strict=True):
+        for step_reward in (0.0, -0.1):
+            mdp = compile_mdp(parse(text, name), slip=slip, step_reward=step_reward)
+            yield f"{name} (slip {slip:g}, step reward {step_reward:g}, gamma {gamma:g})", mdp, gamma
+
+
+def policies(mdp: Mdp) -> np.ndarray:
+    """A random policy (S, A)."""
+    return np.random.default_rng(0).dirichlet(np.ones(mdp.num_actions), mdp.num_states)
+
+
+def compare(function: str, found: np.ndarray, exact: np.ndarray, where: str, tolerance: float) -> None:
+    error = np.abs(found - exact)
+    if not error.max() <= tolerance:
+        state = int(np.unravel_index(error.argmax(), error.shape)[0])
+        raise WrongAnswerError(f"`{function}` is wrong by {error.max():.2g} in state {state} of {where}")
+
+
+@exercise("1.1 by hand", points=2)
+def by_hand(work: Work) -> str:
+    mdp = compile_mdp(parse("S..G\n", "the corridor"))
+    for name, probabilities in (("VALUES_RIGHT", [0, 1, 0, 0]), ("VALUES_COIN", [0, 0.5, 0, 0.5])):
+        exact = Chain(mdp, np.tile(np.array(probabilities, dtype=float), (4, 1))).value(0.9)[:3]
+        found = work.value(name)
+        if not isinstance(found, list) or len(found) != 3 or None in found:
+            raise WrongAnswerError(f"`{name}` must have three numbers")
+        wrong = np.flatnonzero(np.abs(np.array(found, dtype=float) - exact) > 1e-5)
+        if wrong.size:
+            raise WrongAnswerError(f"`{name}`: the value of state {wrong[0]} is not {found[wrong[0]]:.6g}")
+    return "all six values are right"
+
+
+@exercise("1.2 backup", points=2)
+def one_backup(work: Work) -> str:
+    for where, mdp, gamma in worlds():
+        v = np.random.default_rng(1).normal(size=mdp.num_states) * ~mdp.terminal
+        found = work.array("backup", mdp, v, gamma, shape=mdp.next_state.shape[:2])
+        compare("backup", found, backup(mdp, v, gamma), where, 1e-9)
+    return "right in six worlds"
+
+
+@exercise("1.3 values of a policy", points=3)
+def values_of_a_policy(work: Work) -> str:
+    for where, mdp, gamma in worlds():
+        policy = policies(mdp)
+        found = work.array("policy_values", mdp, policy, gamma, shape=(mdp.num_states,))
+        compare("policy_values", found, Chain(mdp, policy).value(gamma), where, TOLERANCE)
+    return "right in six worlds, for random policies"
+
+
+@exercise("1.4 value iteration", points=3)
+def optimal_values(work: Work) -> str:
+    for accuracy in (1e-6, 1e-3):
+        for where, mdp, gamma in worlds():
+            found = work.array("value_iteration", mdp, gamma, accuracy, shape=(mdp.num_states,))
+            asked = f"{where}, where {accuracy:g} was asked for"
+            compare("value_iteration", found, solved(mdp, gamma).v, asked, accuracy)
+    return "as accurate as asked for in six worlds"
+
+
+@exercise("1.5 all optimal actions", points=3)
+def all_optimal_actions(work: Work) -> str:
+    for where, mdp, gamma in worlds():
+        exact = solved(mdp, gamma)
+        found = work.array("optimal_actions", mdp, exact.v, gamma, shape=exact.optimal.shape)
+        wrong = np.flatnonzero(((found != exact.optimal) & mdp.acting[:, None]).any(axis=1))
+        if wrong.size:
+            raise WrongAnswerError(f"`optimal_actions` differs in {mdp.state_name(int(wrong[0]))} of {where}")
+    return "right in six worlds, with all ties"
+
+
+@exercise("1.6 policy iteration", points=3)
+def optimal_policy(work: Work) -> str:
+    for where, mdp, gamma in worlds():
+        found = work.array("policy_iteration", mdp, gamma, shape=(mdp.num_states,))
+        if not np.isin(found, range(mdp.num_actions)).all():
+            raise WrongAnswerError(f"`policy_iteration` must return actions from 0 to {mdp.num_actions - 1}")
+        score = Evaluator(mdp, gamma, 100).score(np.eye(mdp.num_actions)[found.astype(int)])
+        if not score.certified:
+            raise WrongAnswerError(f"`policy_iteration` has a regret of {score.regret:.2g} in {where}")
+    return "certified optimal in six worlds"

@@ -1,0 +1,126 @@
+"""A lab sheet: where its marking is, and the points of a student's notebook.
+
+The marking of `lab1_values.ipynb` is `marking/lab1_values.py` next to it: a function for each exercise,
+decorated with `exercise`. It asks the student's functions through `Work`, compares in its own process, and
+returns a sentence for full points or raises `WrongAnswerError` for none.
+"""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from gridworld.base.console import program
+from gridworld.base.errors import InputError, in_short
+from gridworld.base.safe_read import read_object
+from gridworld.grading.work import Work, WrongAnswerError
+
+COURSE = (
+    Path(__file__).resolve().parents[2] / "docs" / "course"
+)  # where the shipped sheets are, in the source
+NOT_GRADED = "# not graded"  # how the first line of a cell begins that is not run here
+_LARGEST_NOTEBOOK = 64 * 2**20  # bytes
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Exercise:
+    """An exercise of a sheet, and how it is marked."""
+
+    title: str
+    points: int
+    mark: Callable[[Work], str]
+
+
+def exercise(title: str, points: int) -> Callable[[Callable[[Work], str]], Exercise]:
+    """Make a function the marking of an exercise.
+
+    Args:
+        title: its number and name, as in the sheet.
+        points: for a right answer.
+
+    Returns:
+        A decorator. The function gets the student's `Work`, returns one sentence for full points, and raises
+        `WrongAnswerError` with one sentence for none.
+    """
+    return lambda mark: Exercise(title, points, mark)
+
+
+def find_sheet(name: str) -> Path:
+    """The notebook of a sheet: a path, or the number of a shipped one."""
+    if name.isdigit():
+        if not COURSE.is_dir():
+            raise InputError(
+                f"{program('grade')} {name}: needs docs/course of a source checkout; give a path"
+            )
+        known = sorted(COURSE.glob("lab*.ipynb"))
+        found = [path for path in known if path.name.startswith(f"lab{name}_")]
+        if not found:
+            raise InputError(f"{name}: not a lab sheet; must be from 1 to {len(known)}, or a notebook's path")
+        return found[0]
+    return Path(name)
+
+
+def read_exercises(sheet: Path) -> list[Exercise]:
+    """The exercises of a sheet, from the file of its marking."""
+    path = sheet.parent / "marking" / f"{sheet.stem}.py"
+    if not path.is_file():
+        raise InputError(f"{path}: missing; the marking of {sheet.name} must be in this file")
+    try:
+        names = runpy.run_path(str(path))
+    except Exception as error:
+        raise InputError(f"{path}: cannot be run ({in_short(error)})") from error
+    found = [each for each in names.values() if isinstance(each, Exercise)]
+    if not found:
+        raise InputError(f"{path}: has no exercise; a function decorated with `exercise` is one")
+    return found
+
+
+def read_cells(notebook: Path) -> dict[int, str]:
+    """The source of the code cells of a notebook that are graded, by their number among the code cells."""
+    cells = read_object(notebook, _LARGEST_NOTEBOOK).get("cells")
+    if not isinstance(cells, list) or not all(isinstance(cell, dict) for cell in cells):
+        raise InputError(f"{notebook}: must be a Jupyter notebook of format 4, with a list of cells")
+    sources = [cell.get("source", "") for cell in cells if cell.get("cell_type") == "code"]
+    texts = [source if isinstance(source, str) else "".join(map(str, source)) for source in sources]
+    return {number: text for number, text in enumerate(texts, 1) if not text.startswith(NOT_GRADED)}
+
+
+Marked = tuple[Exercise, int, str]  # its points, and the sentence that says why
+
+
+def grade(sheet: Path, notebook: Path, seconds: float, memory: int) -> Iterator[str | Marked]:
+    """Mark a student's notebook.
+
+    Args:
+        sheet: the sheet's notebook, see `find_sheet`.
+        notebook: the student's.
+        seconds: for each cell, and for each exercise.
+        memory: bytes that the student's process may address.
+
+    Yields:
+        Notes on cells that failed, then the result of each exercise.
+
+    Raises:
+        InputError: a file that is missing or is not what it must be.
+    """
+    exercises, cells = read_exercises(sheet), read_cells(notebook)
+    with Work(cells, seconds, memory, [sheet.parent, COURSE, _PACKAGE]) as work:
+        work.begin()
+        if not work.fenced:
+            yield "this system has no Landlock (Linux 5.13): the notebook can read your files"
+        yield from (f"code cell {number} {why}" for number, why in work.failed.items())
+        for each in exercises:
+            yield (each, *_mark(each, work))
+
+
+def _mark(each: Exercise, work: Work) -> tuple[int, str]:
+    work.begin()
+    try:
+        return each.points, each.mark(work)
+    except WrongAnswerError as error:
+        return 0, str(error)
+    except Exception as error:  # of plain data that has another form than the marking expects
+        return 0, f"cannot be marked: the answer has another form ({in_short(error)})"
