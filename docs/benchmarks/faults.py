@@ -12,6 +12,7 @@ import argparse
 import itertools
 import json
 import multiprocessing
+import re
 import statistics
 import sys
 import tempfile
@@ -75,6 +76,12 @@ class Fault:
             if self.is_class
             else f"{self.operator} {self.agent}: {self.change}"
         )
+
+    @property
+    def title(self) -> str:
+        """Its row's title: where it is from, its operator, and what was changed."""
+        change = re.sub(r"agent\.(policy_kwargs\.)?|torch\.(nn|optim)\.", "", self.change)
+        return f"{self.source}: {self.operator} | {self.agent if self.is_class else f'{self.agent} {change}'}"
 
     @property
     def words(self) -> list[str]:
@@ -285,8 +292,8 @@ def table(rows: Rows) -> Iterator[str]:
     by_class = {each.change: probes[each.name] for each in (*SOUND, *CATALOGUE) if each.name in probes}
     totals: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     confusions: Counter[tuple[str, str]] = Counter()
-    yield "| fault | half | runs | spoilt | first cause right | named instead | `check` | rewards |"
-    yield "|---|---|--:|--:|--:|---|---|---|"
+    yield "| fault | agent | half | runs | spoilt | first cause right | named instead | `check` | rewards |"
+    yield "|---|---|---|--:|--:|--:|---|---|---|"
     for fault in CATALOGUE:
         mine = of[fault.name]
         spoilt = [row for row in mine if not row["certified"]]
@@ -299,7 +306,7 @@ def table(rows: Rows) -> Iterator[str]:
         check = "-" if failed is None else ", ".join(failed) or "passes"
         instead = ", ".join(f"{cause} {count}" for cause, count in wrong.items())
         yield (
-            f"| {fault.source}: {fault.name} | {half(fault)} | {len(mine)} | {len(spoilt)} | {right} | "
+            f"| {fault.title} | {half(fault)} | {len(mine)} | {len(spoilt)} | {right} | "
             f"{instead} | {check} | {'killed' if is_killed else '-'} |"
         )
         for key in ((fault.source, half(fault)), ("all", half(fault))):
@@ -329,7 +336,8 @@ def table(rows: Rows) -> Iterator[str]:
         short = Counter(str(row["cause"]) for row in mine if not row["certified"])
         causes = ", ".join(f"{cause} {count}" for cause, count in short.most_common())
         certified = sum(row["certified"] for row in mine)
-        yield f"| {fault.name} | {len(mine)} | {certified} | {causes} | {short['implementation']} |"
+        what = f"`{fault.change}`" if fault in SHIPPED else f"a class derived from {fault.agent.upper()}"
+        yield f"| {what} | {len(mine)} | {certified} | {causes} | {short['implementation']} |"
     took = [row["seconds"] for row in rows] or [0]
     yield f"\n{len(rows)} trainings, {statistics.median(took):.1f} seconds each at the median."
 
