@@ -74,7 +74,7 @@ def trained(
                 f"`train` has the return {strange[0]:.4g} at {mdp.name}, which no episode has; sum all its "
                 "rewards without a discount"
             )
-        if np.any(work.call("train", mdp, algorithm, 1, EPSILON, 0.0, GAMMA, seed)[0]):
+        if np.any(work.call("train", mdp, algorithm, 1, 1.0, 0.0, GAMMA, seed)[0]):
             raise WrongAnswerError("`train` changes q with alpha = 0; q must begin with 0, and move by alpha")
         yield mdp.name, mdp, q
 
@@ -142,7 +142,8 @@ def both_returns(work: Work) -> str:
             exact = [at_start(mdp, policy, 1.0) for policy in policies]
             for which, mine, true in zip(("greedy", "on-line"), found, exact, strict=True):
                 if not abs(mine - true) <= 1e-6 * abs(true):
-                    raise WrongAnswerError(f"the {which} return at {mdp.name} is wrong for {epsilon:g}")
+                    where = f"{mdp.name} is wrong for epsilon {epsilon:g}"
+                    raise WrongAnswerError(f"the {which} return at {where}")
     return "both are exact at two cliffs"
 
 
