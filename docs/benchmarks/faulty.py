@@ -1,7 +1,7 @@
 """Faults that others have collected, as classes derived from Stable-Baselines3's DQN, PPO and A2C.
 
 The operators are those of RLMutation (Tambon et al., 2023) and the programs those of DRLinter (Nikanjam et
-al., 2022), written anew for Stable-Baselines3. `faults.py` trains them and has the faults that are settings.
+al., 2022), written for Stable-Baselines3. `faults.py` trains them and has the faults that are settings.
 """
 
 from __future__ import annotations
