@@ -103,13 +103,16 @@ class Snapshots:
         attributes.clear()
         attributes.update(_Unpickler(io.BytesIO(snapshot), self._kept).load())
 
-    def key(self, without: Collection[str] = ()) -> bytes:
-        """A digest of the state, but for some attributes; UnreadableError where it cannot be compared."""
+    def key(self, without: Collection[str] = (), kinds: bool = False) -> bytes:
+        """A digest of the state, but for some attributes; UnreadableError where it cannot be compared.
+
+        Without `kinds` a tuple is the same as a list or an array of its numbers, whose steps may differ.
+        """
         if self._read_by is not None:
             return self._digest(self._read_by(self._env))
         attributes = self._attributes(without)
         try:
-            return self._digest([part for item in attributes for part in item])
+            return self._digest([part for item in attributes for part in item], kinds)
         except UnreadableError:
             for name, value in attributes:
                 try:
@@ -134,8 +137,8 @@ class Snapshots:
                 return value
         return None
 
-    def _digest(self, value: Any) -> bytes:
-        return digest(value, self._known(), self._generators, self._kept_value)
+    def _digest(self, value: Any, kinds: bool = False) -> bytes:
+        return digest(value, self._known(), self._generators, self._kept_value, kinds)
 
     def _kept_value(self, value: Any) -> tuple[Any, Sequence[Any]]:
         if id(value) not in self._read:

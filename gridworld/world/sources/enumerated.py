@@ -111,6 +111,7 @@ class State:
 
     number: int
     key: bytes
+    alike: bytes  # its key without types of numbers
     seen: bytes  # a digest of the observation with which it was found
     depth: int  # steps from the start
     copy: bytes  # b"" where it is no longer needed
@@ -314,7 +315,7 @@ class Search:
             raise self.refusal(f"its state cannot be copied: {error}") from error
         short = digest(copy)
         if (state := self._by_copy.get(short)) is None:
-            key = self._snapshots.key(self.ignore)
+            key = self._snapshots.key(self.ignore, kinds=True)
             state = self._by_key.get(key) or self._added(key, seen, depth, copy)
             self._by_copy[short] = state
         if state.seen != seen and not self._branching.has_drawn:
@@ -327,7 +328,7 @@ class Search:
 
     def _added(self, key: bytes, seen: bytes, depth: int, copy: bytes) -> State:
         size, (name, place) = 1 + len(self.states), self._named()
-        state = State(size - 1, key, seen, depth, copy, name, place)
+        state = State(size - 1, key, self._snapshots.key(self.ignore), seen, depth, copy, name, place)
         self._by_key[key] = state
         self.states.append(state)
         self._num_bytes += len(copy)
@@ -399,7 +400,6 @@ class Search:
     def compiled(self, limit: int | None) -> Mdp:
         """The world of what was found; a state in which nothing was tried stays as it is."""
         steps = [each.steps for each in self.states]
-        classes = list(range(len(steps)))
         if self.is_random:  # where an episode is over, nothing but the observation matters
             steps = [
                 [
@@ -408,7 +408,8 @@ class Search:
                 ]
                 for rows in steps
             ]
-            classes = lumped(steps)
+        # Else, what differs only in the types of numbers counts as one where the steps are the same.
+        classes = lumped(steps, [None if self.is_random else each.alike for each in self.states])
         members: dict[int, list[State]] = {}
         for state, number in zip(self.states, classes, strict=True):
             members.setdefault(number, []).append(state)

@@ -160,8 +160,11 @@ class Replay:
         way: list[tuple[int, int]] = []
         while target != node:
             origin = int(before[target])
-            leading = [target in {each.following for each in row} for row in self._nodes[origin].rows]
-            way.append((leading.index(True), target))
+            rows = self._nodes[origin].rows
+            leading = [
+                number for number, row in enumerate(rows) if target in {each.following for each in row}
+            ]
+            way.append((int(self._random.choice(leading)), target))
             target = origin
         return way[::-1] or [(int(self._random.integers(self._mdp.num_actions)), -1)]
 
@@ -176,7 +179,7 @@ class Replay:
         self._num_compared += 1
         copy = digest(self._snapshots.take())
         if copy not in self._keys:
-            self._keys[copy] = self._snapshots.key(self._search.ignore)
+            self._keys[copy] = self._snapshots.key(self._search.ignore, kinds=True)
         return self._keys[copy]
 
     def _compare(self, what: str, found: Any, expected: Any) -> None:

@@ -397,6 +397,29 @@ def _closure() -> Any:
     return lambda: rng.integers(2)
 
 
+class Kinds(World):
+    """Whether a list or a tuple is held is part of the state: action 1 makes a tuple, which pays once."""
+
+    def begin(self) -> tuple[int, Any]:
+        return 0, [0]
+
+    def move(self, action: int) -> tuple[tuple[int, Any], float, bool]:
+        time, held = self.at
+        drawn = int(self.np_random.integers(3))
+        if time == 2:
+            held = (0,) if action == 1 and drawn == 0 else [0]
+        paid = 10.0 * (time == 59 and action == 1 and isinstance(held, tuple))
+        return (time + 1, held), paid, time == 59
+
+    def show(self) -> int:
+        return self.at[0]  # type: ignore[no-any-return]
+
+
+def test_what_differs_in_type_only_may_differ_in_what_it_does(compiled: Any) -> None:
+    value = Evaluator(compiled(Kinds), 1.0, 60).optimal_value
+    assert value == pytest.approx(10 / 3)
+
+
 _turns = itertools.cycle([0, 1])
 _thread = threading.local()
 
