@@ -159,6 +159,7 @@ class _Pickler(pickle.Pickler):
     def __init__(self, file: io.BytesIO, env: Any, kept: dict[int, Any], replaced: dict[int, Any]) -> None:
         super().__init__(file, protocol=5)
         self._env, self._kept_by_id, self._replaced = env, kept, replaced
+        self._views: dict[int, list[Any]] = {}  # arrays by that whose memory they show
 
     def reducer_override(self, obj: Any) -> Any:  # three times as fast as `persistent_id`
         if id(obj) in self._replaced:
@@ -167,6 +168,11 @@ class _Pickler(pickle.Pickler):
         if obj is not _kept and (obj is self._env or local or isinstance(obj, _KEPT)):
             self._kept_by_id[id(obj)] = obj
             return _kept, (id(obj),)
+        if isinstance(obj, np.ndarray):
+            views = self._views.setdefault(id(obj if obj.base is None else obj.base), [])
+            if any(np.may_share_memory(obj, each) for each in views):
+                raise TypeError("two arrays share memory; hold one of them")
+            views.append(obj)
         return NotImplemented
 
 

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -265,6 +266,8 @@ class Search:
         actions = range(self._num_actions)
         with self._no_other_draws("step"):
             steps = [self._merged(partial(self._stepped, state, action)) for action in actions]
+        if state.number.bit_count() == 1:  # 1, 2, 4, 8 ...
+            self._check_resets(state)
         if state.number % _SAMPLED:
             self._num_bytes -= len(state.copy)
             state.copy = b""
@@ -277,6 +280,8 @@ class Search:
             shown = float(reward), bool(terminated), bool(truncated)
         except Exception as error:  # whatever it raises
             raise self.refusal(f"a step with action {action} fails: {error}") from error
+        if not math.isfinite(shown[0]):
+            raise self.refusal(f"a step with action {action} pays {shown[0]}; must be a finite number")
         return *self._state_after(observation, state.depth + 1, is_over=shown[1]), *shown
 
     def _merged(self, run: Callable[[], tuple[int, bytes, float, bool, bool]]) -> list[Step]:

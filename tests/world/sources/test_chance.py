@@ -543,6 +543,24 @@ UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
         },
         "its state is not the enumerated one",
     ),
+    "a view of an array": (
+        {
+            "begin": lambda s: s.__dict__.update(grid=(grid := np.zeros(4)), row=grid[1:]) or 0,
+            "move": lambda s, a: (int(s.np_random.integers(2)), 0.0, False),
+        },
+        "two arrays share memory",
+    ),
+    "what a reset leaves": (
+        {
+            "begin": lambda s: getattr(s, "luck", 0) * 0,
+            "move": lambda s, a: (setattr(s, "luck", int(s.np_random.integers(2))) or 0, 0.0, False),
+        },
+        r"a reset does not always lead to the same state \(in luck\)",
+    ),
+    "no reward": (
+        {"move": lambda s, a: (0, [1.0, np.nan][s.np_random.integers(2)], False)},
+        "pays nan; must be a finite",
+    ),
     "too many states": (
         {"move": lambda s, a: (s.at + int(s.np_random.integers(2)), 0.0, False), "show": lambda s: 0},
         "more than 300 states",
