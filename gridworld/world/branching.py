@@ -189,7 +189,11 @@ class Branching:
         self._check("uniform", low, high, size)
         start, drawn = Fraction(float(low)), self.line()
         width = Fraction(float(high)) - start
-        return _many(size, object, lambda: Uniform(self, drawn, [Fraction(0), Fraction(1)], width, start))
+        return _many(
+            size,
+            object,
+            lambda: Uniform(self, drawn, [Fraction(0), Fraction(1)], width, start, size is not None),
+        )
 
     def integers(
         self, low: Any, high: Any = None, size: Any = None, dtype: Any = np.int64, endpoint: bool = False

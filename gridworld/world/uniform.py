@@ -22,7 +22,7 @@ _WIDEST = 2**500  # an interval, near which floats overflow
 class Uniform:
     """`scale` * u + `offset`, where all that is known of u is the interval of [0, 1) that it is in."""
 
-    __slots__ = ("_branching", "_drawn", "_interval", "_offset", "_run", "_scale")
+    __slots__ = ("_branching", "_drawn", "_interval", "_is_numpys", "_offset", "_run", "_scale")
 
     def __init__(
         self,
@@ -31,7 +31,9 @@ class Uniform:
         interval: list[Fraction],
         scale: Fraction,
         offset: Fraction,
+        is_numpys: bool,
     ) -> None:
+        self._is_numpys = is_numpys  # a scalar of numpy's, whose comparisons are numpy's too
         self._branching, self._run, self._drawn = branching, branching.run, drawn
         self._interval, self._scale, self._offset = interval, scale, offset
         width = abs(scale)
@@ -90,12 +92,15 @@ class Uniform:
         start = self._among([cut for cut, is_not in zip(cuts, infinite, strict=True) if not is_not])
         found = np.array([(cut > start) == (self._scale > 0) for cut in cuts], dtype=np.bool_)
         found = np.where(infinite, given.ravel() > 0, found).reshape(given.shape)
-        return bool(found) if given.ndim == 0 else found
+        if given.ndim:
+            return found
+        return np.bool_(found) if self._is_numpys or isinstance(threshold, _NUMPYS) else bool(found)
 
     __lt__ = __le__ = _is_below  # to be just at a threshold has no probability
 
     def _is_above(self, threshold: Any) -> Any:
-        return np.logical_not(below) if np.ndim(below := self._is_below(threshold)) else not below
+        below = self._is_below(threshold)
+        return np.logical_not(below) if isinstance(below, _NUMPYS) else not below
 
     __gt__ = __ge__ = _is_above
 
@@ -122,7 +127,8 @@ class Uniform:
             return self._refuse()
         self._refuse_narrow(other)
         scale, offset = change(Fraction(float(other)))
-        return Uniform(self._branching, self._drawn, self._interval, scale, offset)
+        is_numpys = self._is_numpys or isinstance(other, _NUMPYS)
+        return Uniform(self._branching, self._drawn, self._interval, scale, offset, is_numpys)
 
     def __add__(self, other: Any) -> Any:
         return self._changed(other, lambda number: (self._scale, self._offset + number))
@@ -160,6 +166,7 @@ class Uniform:
         return getattr(other, theirs)(one)
 
 
+_NUMPYS = (np.generic, np.ndarray)
 _OTHER_FLOATS = [np.dtype(each) for each in (np.float16, np.float32, np.longdouble)]
 _OPERATIONS = {  # by the name of numpy's function: for it on the left, and on the right
     "less": ("__lt__", "__gt__"),

@@ -105,6 +105,9 @@ def test_probabilities_are_exact() -> None:
         lambda rng: rng.integers(3, dtype=np.int8),
         lambda rng: rng.integers(3, dtype=int),
         lambda rng: rng.binomial(3, 0.5),
+        lambda rng: rng.random() < 0.5,
+        lambda rng: 1 - rng.random() > np.float64(0.5),
+        lambda rng: 2 * rng.random(2)[0] >= 1,
     ],
 )
 def test_types_are_those_of_numpy(draw: Callable[[Any], Any]) -> None:
