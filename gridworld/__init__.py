@@ -6,6 +6,7 @@
     gridworld.make_vec_env("cliff")         # an environment for Stable-Baselines3
     gridworld.ExactEvalCallback()           # exact curves in its own training
     gridworld.check("my_package.MyPPO")     # tests an algorithm on worlds with known answers
+    gridworld.examine(env)                  # why nothing learns in an environment, and what to change
     gym.make("gridworld:GridWorld-v0")      # the environment alone
 
 Importing it registers the environment and loads nothing else; torch is imported when a name needs it.

@@ -15,6 +15,8 @@ from gridworld.api.worlds import compile_env as compile_env
 from gridworld.api.worlds import evaluate as evaluate
 from gridworld.api.worlds import make_vec as make_vec
 from gridworld.base.errors import InputError as InputError
+from gridworld.checking.examine import ExamineResult as ExamineResult
+from gridworld.checking.examine import examine as examine
 from gridworld.checking.run import CheckResult as CheckResult
 from gridworld.checking.run import check as check
 from gridworld.envs.env import GridWorldEnv as GridWorldEnv

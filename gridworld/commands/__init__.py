@@ -31,6 +31,7 @@ COMMANDS = {
     "reproduce": "repeat a finished run and compare it bit for bit",
     "tune": "tune an agent's settings for a task, and confirm the winner",
     "check": "check an algorithm's implementation on worlds with known answers",
+    "examine": "examine an environment: why nothing learns in it",
     "grade": "mark a student's lab sheet of the course",
     "play": "play a world yourself, next to a trained agent if you like",
     "playground": "draw worlds and watch tables learn, in the browser",

@@ -72,7 +72,7 @@ def test_help_is_a_manual_with_every_choice() -> None:
             continue  # listed by world, see test_recipes.py; chosen by a preset
         line = next(line for line in lines if line.strip().split(" ")[0] == file.stem)
         assert len(line.split()) > 2, f"{file} opens with no comment that says what it is"
-    assert "\n".join(lines).count("python scripts/train.py") >= 5
+    assert "\n".join(lines).count("gridworld train ") >= 5
 
 
 @pytest.mark.parametrize("command", ["-m gridworld --help", "{train} --help", "{train} --cfg job"])

@@ -135,7 +135,7 @@ def test_what_else_is_told(what: str) -> None:
 def test_a_certificate_that_was_lost_is_said() -> None:
     run = gridworld.train(*_SLOW, progress=False)
     first = gridworld.diagnose(run).commands[0]  # takes the place of the setting that it changes
-    assert re.search(r"train.py agent=q_learning seed=0 agent.learning_rate=0\.\d+$", first)
+    assert re.search(r"gridworld train agent=q_learning seed=0 agent.learning_rate=0\.\d+$", first)
     found = diagnosed_as_lost(run)
     assert f"certified at step {run.curve['step'][3]:,}" in found.sentence()
 

@@ -55,7 +55,7 @@ def test_a_link_below_is_not_gone_through(names: tuple[str, ...], tmp_path: Path
 def test_confirming_takes_no_folder_away_through_a_link(link: str, tmp_path: Path, victim: Path) -> None:
     link_to(victim, tmp_path / "study" / link)
     before = contents(victim)
-    run = confirm.HeldOutRun(tmp_path / "study" / "confirm" / "default,00000000,seed=3", configure())
+    run = confirm.HeldOutRun(tmp_path / "study" / "confirm" / "default,00000000,seed=3", configure(), [])
     with pytest.raises(InputError, match=REFUSED):
         confirm.prepare(tmp_path / "study", [run])
     with pytest.raises(InputError, match=REFUSED):

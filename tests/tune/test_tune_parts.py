@@ -365,7 +365,7 @@ def results(*steps: float) -> HeldOutResults:
 
 def test_held_out_runs_of_other_settings_are_other_runs(tmp_path: Path) -> None:
     def names(*words: str) -> list[str]:
-        found = held_out_runs(tmp_path, "default", configure("agent=q_learning", *words), range(3, 6))
+        found = held_out_runs(tmp_path, "default", configure("agent=q_learning", *words), range(3, 6), ())
         assert [run.config.seed for run in found] == [3, 4, 5]
         return [run.folder.name for run in found]
 
@@ -410,7 +410,7 @@ def test_the_verdict(winner: Sequence[float], began_from: Sequence[float], verdi
 
 def test_the_verdict_says_which_runs_it_is_without(tmp_path: Path) -> None:
     config = configure("agent=q_learning")
-    before, winner = (held_out_runs(tmp_path, name, config, range(6)) for name in ("default", "trial=3"))
+    before, winner = (held_out_runs(tmp_path, name, config, range(6), ()) for name in ("default", "trial=3"))
     maker = Maker("agent=q_learning")
     for run in [*before, *winner]:
         maker.write(run.folder, run.config.seed, 3000)

@@ -1,0 +1,293 @@
+"""An environment examined: what it is, and what keeps an agent from learning in it, on one page."""
+
+from __future__ import annotations
+
+import copy
+import re
+import textwrap
+import time
+import uuid
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+
+from gridworld.base.bounds import STEP_LIMIT, Bounds, discount
+from gridworld.base.console import aligned
+from gridworld.base.errors import InputError, in_short
+from gridworld.base.user_input import imported
+from gridworld.checking.sampling import Actions, Env, Replays, generators_restored, replays, sample
+from gridworld.checking.seen import ERROR, EnvFinding, Seen
+from gridworld.checking.symptoms import ALL
+from gridworld.config.compose import named_world
+from gridworld.envs.inspection import world_of
+from gridworld.envs.rollout import wilson_interval
+from gridworld.world.mdp import Mdp
+from gridworld.world.snapshots import Snapshots
+from gridworld.world.sources.enumerated import enumerate_env
+from gridworld.world.sources.gymnasium_table import make_env
+from gridworld.world.wrappers import step_limit
+
+_STEPS = 20_000
+_MOST_STATES = 3_000  # to enumerate
+_SECONDS = 10.0  # for that
+_OF_CHANCE = 30  # how much longer a state takes whose steps draw
+_WIDTH = 100
+Make = Callable[[], Env]
+
+
+@dataclass(frozen=True)
+class ExamineResult:
+    """What was found of an environment; its text is the page."""
+
+    name: str
+    facts: tuple[tuple[str, str], ...]  # what it is, a label and words
+    findings: tuple[EnvFinding, ...]  # the likely causes first
+    seconds: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing was found."""
+        return not self.findings
+
+    @property
+    def topics(self) -> list[str]:
+        """What the findings are about."""
+        return [each.topic for each in self.findings]
+
+    def __str__(self) -> str:
+        facts = aligned([[label, f" {text}"] for label, text in self.facts], ("<12", "<0"))
+        lines = [self.name, "", *facts, ""]
+        for number, each in enumerate(self.findings, 1):
+            found = f"{number}. {each.severity}, {each.topic}: {each.evidence}"
+            for text in (found, f"   Try: {each.advice}"):
+                lines += textwrap.wrap(text, _WIDTH, subsequent_indent="   ", break_long_words=False)
+        count = len(self.findings)
+        what = f"{count} finding{'s' * (count > 1)}" if count else "no findings"
+        return "\n".join([*lines, f"{self.name}: {what}, {self.seconds:.0f} s"])
+
+
+def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0) -> ExamineResult:
+    """Examine an environment: what it is, and what keeps an agent from learning in it.
+
+    It samples episodes of random, held and constant actions and replays some of them. Where the environment
+    has a transition table or its states can be enumerated, what a random policy reaches is exact; elsewhere
+    it is estimated.
+
+    Args:
+        env: an environment of Gymnasium, which is left as it is; a function or class that makes one, without
+            arguments; or a name: an id of Gymnasium, `module:NAME` of a function or class, or a world of
+            this project, e.g. cliff.
+        gamma: the discount that an agent will have.
+        steps: how many steps to sample.
+        seed: of all that is drawn.
+
+    Returns:
+        `findings`, each with `topic`, `severity`, `evidence` and `advice`; `facts`, `passed`; its text
+        is the page.
+
+    Raises:
+        InputError: no such environment, or one that cannot be made or reset.
+
+    Example:
+        >>> examine("CliffWalking-v1").passed
+        True
+    """
+    discount("gamma", gamma)
+    Bounds(low=100).check("steps", steps)
+    began = time.monotonic()
+    with generators_restored(), warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        name, make, mdp = _subject(env)
+        first = _made(name, make)
+        name = type(first.unwrapped).__name__ if "<" in name else name  # of a lambda
+        if problem := _first_look(first, make, seed):
+            advice = "follow gymnasium.Env; gymnasium.utils.env_checker.check_env says more."
+            finding = EnvFinding("interface", ERROR, problem, advice)
+            return ExamineResult(name, (), (finding,), time.monotonic() - began)
+        started = time.monotonic()
+        found = sample(make(), Actions(first.action_space, seed), steps, seed)
+        rate, replayed = len(found.before) / max(time.monotonic() - started, 1e-3), Replays()
+        mdp = _exact(first, make, found.draws) if mdp is None else mdp
+        try:
+            replayed = replays(make, Actions(first.action_space, seed), rate)
+        except Exception as error:  # anybody's code
+            found.failure = found.failure or f"a replayed episode raises {in_short(error)}"
+        limit = step_limit(first) or (None if mdp is None else mdp.max_episode_steps)
+        seen = Seen(first, gamma, found, replayed, _interface(make), limit, mdp)
+        findings = [finding for symptom in ALL for finding in symptom(seen)]
+        facts = tuple(_facts(seen))
+    return ExamineResult(name, facts, tuple(findings), time.monotonic() - began)
+
+
+def _subject(env: Any) -> tuple[str, Make, Mdp | None]:
+    """What to call an environment, how to make it, and its tables if it is a compiled world."""
+    if isinstance(env, str):
+        module, colon, name = env.partition(":")
+        if colon and (found := imported("examine", f"{module}.{name}")) is not None:
+            return env, found, None
+        if re.search(r"-v\d+$", env):
+            make_env(env).close()
+            return env, lambda: make_env(env), None
+        if colon:
+            raise InputError(f"examine {env}: the module {module} has no {name}, nor is that a registered id")
+        env = named_world(env)
+    if isinstance(env, Mdp):
+        limit = env.max_episode_steps or STEP_LIMIT
+        return env.name, lambda: gym.wrappers.TimeLimit(_WorldEnv(env), limit), env
+    if isinstance(env, gym.Env):
+        name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+        try:
+            copy.deepcopy(env)
+        except Exception as error:  # its attributes may be anything
+            reason = f"{name} cannot be copied ({in_short(error)})"
+            raise InputError(f"examine: {reason}; give a function that makes it") from None
+        return name, lambda: copy.deepcopy(env), None
+    if callable(env):
+        return getattr(env, "__name__", type(env).__name__), env, None
+    kind = type(env).__name__
+    raise InputError(
+        f"examine: {kind} is not a single environment; give one, a function that makes one, or a name"
+    )
+
+
+def _made(name: str, make: Make) -> Env:
+    try:
+        env = make()
+    except Exception as error:  # anybody's code
+        raise InputError(f"examine {name}: cannot be made ({in_short(error)})") from error
+    if not isinstance(env, gym.Env):
+        raise InputError(f"examine {name}: makes a {type(env).__name__}, must be a gymnasium.Env")
+    for what in ("observation_space", "action_space"):
+        if not isinstance(getattr(env, what, None), spaces.Space):
+            raise InputError(f"examine {name}: its {what} is not a gymnasium space")
+    return env
+
+
+def _first_look(env: Env, make: Make, seed: int) -> str:
+    """What is wrong with the results of reset() and step(), a sentence; "" for nothing."""
+    call, actions = "reset(seed=0)", Actions(env.action_space, seed).of_episode(0)
+    try:
+        result = make().reset(seed=0)
+        if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
+            return f"{call} returns {_kind(result)}, must be (observation, info)."
+        env.reset(seed=0)
+        call = "step()"
+        stepped: Any = env.step(next(actions))
+        if not (isinstance(stepped, tuple) and len(stepped) == 5):
+            five = "(observation, reward, terminated, truncated, info)"
+            return f"{call} returns {_kind(stepped)}, must be {five}."
+        float(stepped[1])
+    except Exception as error:  # anybody's code
+        return f"{call} raises {in_short(error)}."
+    return ""
+
+
+def _kind(value: Any) -> str:
+    return f"a tuple of {len(value)}" if isinstance(value, tuple) else f"a {type(value).__name__}"
+
+
+def _interface(make: Make) -> str:
+    try:
+        check_env(make().unwrapped, skip_render_check=True, skip_close_check=True)
+    except Exception as error:  # the checker asserts, and runs anybody's code
+        return f"Gymnasium's check_env says: {in_short(error).removeprefix('AssertionError: ')}"
+    return ""
+
+
+def _exact(env: Env, make: Make, draws: bool) -> Mdp | None:
+    """The tables of an environment; None where it has none and cannot be enumerated."""
+    try:
+        return world_of(env)
+    except InputError:
+        pass
+    name = f"gridworld-examined/E{uuid.uuid4().hex}-v0"
+    gym.register(name, lambda **_: make())
+    try:
+        return enumerate_env(name, most_states=_affordable(make(), _OF_CHANCE if draws else 1))
+    except Exception:  # it cannot be enumerated, or its code fails
+        return None
+    finally:
+        del gym.registry[name]
+
+
+def _affordable(env: Env, cost: int) -> int:
+    """How many states can be enumerated in the time for it."""
+    actions, snapshots, began, tries = (
+        Actions(env.action_space, 0),
+        Snapshots(env.unwrapped),
+        time.perf_counter(),
+        20,
+    )
+    for _ in range(tries):
+        env.reset(seed=0)
+        copy_ = snapshots.take()
+        snapshots.put_back(copy_)
+        snapshots.key()
+        env.step(actions.pool[0])
+    seconds = (time.perf_counter() - began) / tries * getattr(env.action_space, "n", 1) * cost
+    return int(np.clip(_SECONDS / seconds, 100, _MOST_STATES))
+
+
+class _WorldEnv(gym.Env[Any, Any]):
+    """A compiled world, one step at a time."""
+
+    def __init__(self, mdp: Mdp) -> None:
+        self._mdp, self._state = mdp, 0
+        self.observation_space = spaces.Discrete(mdp.num_numbers)
+        self.action_space = spaces.Discrete(mdp.num_actions)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[int, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._state = int(self.np_random.choice(self._mdp.num_states, p=self._mdp.start))
+        return int(self._mdp.number[self._state]), {}
+
+    def step(self, action: Any) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        mdp, here = self._mdp, (self._state, int(action))
+        outcome = self.np_random.choice(mdp.probability.shape[2], p=mdp.probability[here])
+        self._state = int(mdp.next_state[(*here, outcome)])
+        reward = float(mdp.reward[(*here, outcome)])
+        return int(mdp.number[self._state]), reward, bool(mdp.terminal[self._state]), False, {}
+
+
+def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
+    """What the environment is, a label and words."""
+    steps, mdp, lengths = seen.steps, seen.mdp, seen.lengths
+    kind = "stochastic" if seen.is_stochastic else "deterministic"
+    yield "steps", f"{kind}; a seed {'repeats' if seen.replays.repeats else 'does not repeat'} an episode"
+    states = "not enumerated; what follows is of a sample"
+    if mdp is not None:
+        states = f"{mdp.reachable.sum():,} can be reached ({mdp.truth.partition(',')[0]})"
+    yield "states", states
+    starts = len(np.unique(steps.before[steps.first]))
+    space = " ".join(str(seen.env.observation_space).split())[:60]
+    met = f"{seen.observed:,} different ones in {len(steps.before):,} steps, {starts:,} at the start"
+    yield "observations", f"{met}; {space}"
+    over, cut = (int(which[steps.last].sum()) for which in (steps.terminated, steps.truncated))
+    limit = f"{seen.limit:,}" if seen.limit else "not known" if cut else "none seen"
+    how = f"{over:,} terminated, {cut:,} truncated; step limit {limit}"
+    yield "episodes", f"{len(lengths):,} of {lengths.min():,} to {lengths.max():,} steps, {how}"
+    rewards = f"from {steps.reward.min() + 0.0:.4g} to {steps.reward.max() + 0.0:.4g}"
+    is_usual = np.mean(steps.reward == seen.usual) >= 0.5 or seen.reach is not None
+    yield "rewards", f"{rewards}, mostly {seen.usual + 0.0:.4g}" if is_usual else rewards
+    at_random = steps.last[steps.at_random[steps.last]]
+    if seen.reach is not None:
+        soonest = "" if seen.reach[1] is None else f", which is {seen.reach[1]:,} steps away"
+        yield "random policy", f"comes to the reward in {seen.reach[0]:.3%} of episodes (exact){soonest}"
+    elif is_usual and (seen.paid.any() or seen.usual <= 0) and len(at_random):
+        hits = len(np.unique(steps.episode[steps.at_random & seen.paid]))
+        low, high = wilson_interval(hits, len(at_random))
+        what = "an end" if (steps.reward <= seen.usual).all() and seen.usual < 0 else "a better reward"
+        interval = f"95 % interval {low:.1%} to {high:.1%}"
+        yield "random policy", f"comes to {what} in {hits:,} of {len(at_random):,} episodes ({interval})"
+    else:
+        returns = np.bincount(steps.episode, steps.reward)[steps.episode[at_random]]
+        found = f"returns {returns.mean():.4g} on average (deviation {returns.std():.3g})"
+        yield "random policy", f"{found} in {len(at_random):,} episodes"

@@ -1,0 +1,299 @@
+"""What is seen of an environment: sampled episodes, and the same actions replayed with seeds that are known.
+
+Episodes have actions at random, held for a while, or always the same, so that the ends that a random policy
+hardly comes to are seen too. A replay seeds the generators of `random` and `numpy.random` as well: who then
+repeats with one seed and not with another draws from them.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import random
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from gridworld.base.errors import in_short
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray
+from gridworld.world.reading import GENERATORS, UnreadableError, digest, generator_state
+from gridworld.world.snapshots import Snapshots, random_states
+
+Env = gym.Env[Any, Any]
+Play = list[tuple[bytes, float, bool, bool]]  # observation, reward, terminated, truncated; of reset first
+LONGEST = 5_000  # steps of an episode, then it is given up
+SEEDS = range(3)  # of replays
+_HORIZON = 100  # steps of a replay
+_POOL = 8  # actions that are held and repeated
+_MOST_HELD = 12  # steps for which one is held
+_WATCHED = 300  # first steps, in which returned arrays and generators are watched
+_MOST_NUMBERS = 256  # of an observation; more, as of an image, are not looked at
+_SECONDS = 15.0  # for the sample
+_REPLAYED = 10.0  # seconds, for the replays; fewer steps where that is not enough
+
+
+@dataclass
+class Steps:
+    """Sampled steps, in order; observations and actions by numbers."""
+
+    episode: IntArray
+    time: IntArray  # steps before, in the episode
+    before: IntArray  # the observation acted on
+    action: IntArray
+    reward: FloatArray
+    after: IntArray
+    terminated: BoolArray
+    truncated: BoolArray
+    at_random: BoolArray  # whether all actions of the episode are independent and uniform
+    vectors: FloatArray | None  # (observations, d), the numbers in their boxes
+    outside: dict[int, str]  # observations that are not in their space, and why
+    changed: int  # arrays that the next step changed, of the first that were returned
+    draws: bool  # whether a step changed the state of a random generator
+    failure: str  # what a step raised, if one did
+
+    @property
+    def last(self) -> IntArray:
+        """The last step of each episode."""
+        return np.flatnonzero(np.append(np.diff(self.episode) != 0, True))
+
+    @property
+    def first(self) -> IntArray:
+        """The first step of each episode."""
+        return np.flatnonzero(self.time == 0)
+
+
+@dataclass
+class Replays:
+    """What replays of the same actions say; `plays` are of other actions, by the seed, for comparison."""
+
+    repeats: bool = True
+    causes: list[str] = field(default_factory=list)  # what it draws from besides `np_random`
+    survivors: list[str] = field(default_factory=list)  # attributes that a reset does not restore
+    starts: int = 1  # different first observations
+    plays: list[list[Play]] = field(default_factory=list)
+
+
+class Actions:
+    """Actions of a space, with a generator of its own."""
+
+    def __init__(self, space: gym.Space[Any], seed: int) -> None:
+        self._space = copy.deepcopy(space)
+        self._space.seed(seed)
+        if isinstance(space, spaces.Discrete):
+            self.pool = [space.start + index for index in range(min(int(space.n), _POOL))]
+        else:
+            self.pool = [self._space.sample() for _ in range(_POOL)]
+            if isinstance(space, spaces.Box):
+                ends = [np.clip(bound, -1e3, 1e3).astype(space.dtype) for bound in (space.low, space.high)]
+                self.pool[:2] = ends
+        self._draw = np.random.default_rng(seed)
+
+    def of_episode(self, number: int) -> Iterator[Any]:
+        """The actions of an episode: of every six, three at random; one each of the pool, held, constant."""
+        kind, held = number % 6, 0
+        action = self.pool[number // 6 % len(self.pool)]
+        while True:
+            if kind % 2 == 0:
+                action = self._space.sample()
+            elif kind == 1 or (kind == 3 and held == 0):
+                action = self.pool[self._draw.integers(len(self.pool))]
+                held = int(self._draw.integers(1, _MOST_HELD))
+            held -= 1
+            yield action
+
+
+@contextmanager
+def generators_restored() -> Iterator[None]:
+    """Leave the generators that all share as they were."""
+    states = random.getstate(), np.random.get_state()
+    try:
+        yield
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])
+
+
+def seen(observation: Any) -> bytes:
+    """A digest of an observation."""
+    try:
+        return digest(observation)
+    except UnreadableError:
+        return repr(observation).encode()
+
+
+def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
+    """Take about so many steps, with one seed for everything."""
+    random.seed(seed)
+    np.random.seed(seed)
+    generators = _generators(env)
+    rows: list[tuple[Any, ...]] = []
+    numbers: dict[bytes, int] = {}
+    acts: dict[bytes, int] = {}
+    vectors: list[FloatArray | None] = []
+    outside: dict[int, str] = {}
+    changed, draws, failure, episode, until = 0, False, "", 0, time.monotonic() + _SECONDS
+
+    def number(observation: Any, key: bytes) -> int:
+        if key not in numbers:
+            numbers[key] = len(numbers)
+            if reason := _outside(env.observation_space, observation):
+                outside[numbers[key]] = reason
+            vectors.append(_vector(env.observation_space, observation))
+        return numbers[key]
+
+    while len(rows) < most and time.monotonic() < until and not failure:
+        action: Any = None
+        taken = 0
+        try:
+            observation, _ = env.reset(seed=seed if episode == 0 else None)
+            key = seen(observation)
+            for taken, action in enumerate(actions.of_episode(episode)):
+                before = number(observation, key)
+                states = _states(generators) if len(rows) < _WATCHED else None
+                after, reward, terminated, truncated, _ = env.step(copy.copy(action))
+                if states is not None:
+                    draws |= states != _states(generators)
+                    changed += seen(observation) != key
+                observation, key = after, seen(after)
+                ends = bool(terminated), bool(truncated)
+                act = acts.setdefault(seen(action), len(acts))
+                row = (episode, taken, before, act, float(reward), number(after, key), *ends)
+                rows.append((*row, episode % 2 == 0))
+                if any(ends) or taken + 1 >= LONGEST:
+                    break
+        except Exception as error:  # the environment may be anybody's
+            failure = f"step {taken + 1} of an episode, with action {action}, raises {in_short(error)}"
+        episode += 1
+    names = ("episode", "time", "before", "action", "reward", "after", "terminated", "truncated", "at_random")
+    kinds = [*[np.int64] * 4, np.float64, np.int64, *[np.bool_] * 3]
+    columns: Any = zip(*rows, strict=True) if rows else [()] * len(names)
+    arrays: Any = {name: np.array(each, kind) for name, kind, each in zip(names, kinds, columns, strict=True)}
+    known = [each for each in vectors if each is not None]
+    alike = len(known) == len(vectors) and len({each.shape for each in known}) == 1
+    return Steps(
+        **arrays,
+        vectors=np.array(known) if alike else None,
+        outside=outside,
+        changed=changed,
+        draws=draws,
+        failure=failure,
+    )
+
+
+def replays(make: Callable[[], Env], actions: Actions, rate: float) -> Replays:
+    """Replay actions in one environment, in a new one, and with other seeds of the shared generators."""
+    found = Replays()
+    steps = int(np.clip(_REPLAYED * rate / (len(SEEDS) * (6 * 3 + _POOL)), 5, _HORIZON))
+    lists = [list(itertools.islice(actions.of_episode(kind), steps)) for kind in (0, 1, 3)]
+
+    def plays(env: Env | None, shared: tuple[int, int], which: Sequence[list[Any]]) -> list[list[Play]]:
+        random.seed(shared[0])
+        np.random.seed(shared[1])
+        env = make() if env is None else env
+        return [[_play(env, each, seed, shared) for each in which] for seed in SEEDS]
+
+    env = make()
+    base = plays(env, (1, 1), lists)
+    found.starts = len({each[0][0][0] for each in base})
+    again, new, newer = plays(env, (1, 1), lists), plays(None, (1, 1), lists), plays(None, (1, 1), lists)
+    for name, shared in (("the module random", (2, 1)), ("numpy.random", (1, 2))):
+        if new == newer != plays(None, shared, lists):
+            found.causes.append(name)
+    own = [name for name, value in vars(env.unwrapped).items() if type(value) in GENERATORS]
+    own = [name for name in own if name != "_np_random"]
+    found.repeats = base == again == new and not found.causes
+    if base != again or base != new:
+        found.causes += [f"its generator {name}" for name in own]
+        if new == newer and not own:
+            found.survivors = _survivors(make, env)
+    if base == new:
+        held = [[action] * steps for action in actions.pool]
+        held_plays = plays(None, (1, 1), held)
+        found.plays = [one + two for one, two in zip(base, held_plays, strict=True)]
+    return found
+
+
+def _survivors(make: Callable[[], Env], used: Env) -> list[str]:
+    """The attributes that a reset leaves as an earlier episode made them; "" for one that is not found."""
+    keys = []
+    try:
+        for env in (make(), used):
+            random.seed(1)
+            np.random.seed(1)
+            env.reset(seed=0)
+            keys.append(Snapshots(env.unwrapped).keys())
+    except (UnreadableError, TypeError):
+        return [""]
+    return sorted(name for name in keys[0] | keys[1] if keys[0].get(name) != keys[1].get(name)) or [""]
+
+
+def _play(env: Env, actions: Sequence[Any], seed: int, shared: tuple[int, int]) -> Play:
+    random.seed(shared[0])
+    np.random.seed(shared[1])
+    observation, _ = env.reset(seed=seed)
+    found: Play = [(seen(observation), 0.0, False, False)]
+    for action in actions:
+        observation, reward, terminated, truncated, _ = env.step(copy.copy(action))
+        found.append((seen(observation), float(reward), bool(terminated), bool(truncated)))
+        if terminated or truncated:
+            break
+    return found
+
+
+def _generators(env: Env) -> list[Any]:
+    own = [value for value in vars(env.unwrapped).values() if type(value) in GENERATORS]
+    return [env.unwrapped, *own]
+
+
+def _states(generators: Sequence[Any]) -> list[Any]:
+    env, *own = generators
+    return [*map(generator_state, [env.np_random, *own]), *random_states()]
+
+
+def _outside(space: gym.Space[Any], observation: Any) -> str:
+    """How an observation is outside of its space, as the rest of a sentence; "" where it is inside."""
+    if not isinstance(space, spaces.Box):
+        return "" if space.contains(observation) else f"is {_short(observation)}"
+    try:
+        values = np.asarray(observation, np.float64)
+    except (TypeError, ValueError):
+        return f"is {_short(observation)}"
+    if values.shape != space.shape:
+        kind = type(observation).__name__
+        return f"is a {kind} of shape {values.shape}, must be an array of shape {space.shape}"
+    if not np.isfinite(values).all():
+        return f"contains {values[~np.isfinite(values)].flat[0]}"
+    slack = 1e-5 * np.maximum(1.0, np.abs(values))
+    wrong = (values < space.low - slack) | (values > space.high + slack)
+    if not wrong.any():
+        return ""
+    place = np.unravel_index(int(np.argmax(wrong)), wrong.shape) if wrong.ndim else ()
+    low, high = space.low[place], space.high[place]
+    return f"has {values[place]:.4g} at {[*map(int, place)]}, must be from {low:.4g} to {high:.4g}"
+
+
+def _short(value: Any) -> str:
+    return f"{type(value).__name__} {' '.join(str(value).split())[:60]}"
+
+
+def boxes(space: gym.Space[Any]) -> list[str | None]:
+    """The keys of the boxes in an observation space; None for the space itself."""
+    if isinstance(space, spaces.Dict):
+        return [key for key, each in space.items() if isinstance(each, spaces.Box)]
+    return [None] if isinstance(space, spaces.Box) else []
+
+
+def _vector(space: gym.Space[Any], observation: Any) -> FloatArray | None:
+    parts = [observation if key is None else observation[key] for key in boxes(space)]
+    if sum(np.size(part) for part in parts) > _MOST_NUMBERS:
+        return None
+    try:
+        return np.concatenate([np.asarray(part, np.float64).ravel() for part in parts]) if parts else None
+    except (TypeError, ValueError):
+        return None
