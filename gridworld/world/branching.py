@@ -32,6 +32,7 @@ Weights = tuple[Fraction, ...]
 
 _MOST_DRAWS = 500  # of one step; a loop that rejects what it draws may have any number
 MOST_BRANCHES = 100_000  # of one step
+_REPEATED = 1_000  # first runs that are repeated, and later one in so many
 _UNLIKE = (
     "; draw by choice, integers, permutation, binomial, multinomial, or compare random() with a threshold"
 )
@@ -49,6 +50,8 @@ class _Decision:
 class Branching:
     """Stands for a `numpy.random.Generator`; `where` is what messages call the environment."""
 
+    __class__ = property(lambda _: np.random.Generator)  # as one that asks sees it
+
     def __init__(self, where: str) -> None:
         self._where = where
         self._real = np.random.default_rng(0)  # refuses what numpy refuses
@@ -58,24 +61,20 @@ class Branching:
         self._refused: InputError | None = None  # kept, since an environment may catch it
         self.run = 0  # counts the runs, so that what is left of another one is recognised
         self._is_running = False
+        self._num_results = 0
 
     def outcomes(self, step: Callable[[], Result]) -> Iterator[tuple[Fraction, Result]]:
         """Run a step once for each sequence of draws: the probability and the result of each."""
         self._decisions, self._taken = [], []
         for _ in range(MOST_BRANCHES):
-            self._place, self.run, self._is_running = 0, self.run + 1, True
-            try:
-                result = step()
-            except Exception:
-                if self._refused is None:
-                    raise
-            finally:
-                self._is_running = False
-            if self._refused is not None:
-                raise self._refused
-            if self._place < len(self._decisions):
-                raise self._not_repeatable()
+            result = self._ran(step)
             yield self._probability(), result
+            self._num_results += 1
+            if self._num_results <= _REPEATED or self._num_results % _REPEATED == 0:
+                # Once, twice or three times, so that no memory has the same rhythm.
+                for _ in range(1 + self._num_results % 3):
+                    if self._ran(step) != result:
+                        raise self._not_repeatable()
             while self._taken and self._taken[-1] + 1 == len(self._decisions[-1].possible):
                 self._taken.pop()
                 self._decisions.pop()
@@ -83,6 +82,23 @@ class Branching:
                 return
             self._taken[-1] += 1
         raise InputError(f"{self._where}: one step has more than {MOST_BRANCHES:,} random outcomes")
+
+    def _ran(self, step: Callable[[], Result]) -> Result:
+        """The result of a step with the decisions that are taken, and first outcomes after them."""
+        self._place, self.run, self._is_running = 0, self.run + 1, True
+        result: Any = None
+        try:
+            result = step()
+        except Exception:
+            if self._refused is None:
+                raise
+        finally:
+            self._is_running = False
+        if self._refused is not None:
+            raise self._refused
+        if self._place < len(self._decisions):
+            raise self._not_repeatable()
+        return result  # type: ignore[no-any-return]
 
     @property
     def has_drawn(self) -> bool:
@@ -162,8 +178,8 @@ class Branching:
 
     def random(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
         """A number from [0, 1), or an array of them, that can be compared."""
-        if out is not None:
-            self.refuse("random(out=...) makes numbers that cannot be enumerated")
+        if out is not None or np.dtype(dtype) != np.float64:
+            self.refuse("random() with out or of 32 bits makes numbers that cannot be enumerated")
         return self.uniform(0.0, 1.0, size)
 
     def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
@@ -173,7 +189,11 @@ class Branching:
         self._check("uniform", low, high, size)
         start, drawn = Fraction(float(low)), self.line()
         width = Fraction(float(high)) - start
-        return _many(size, object, lambda: Uniform(self, drawn, [Fraction(0), Fraction(1)], width, start))
+        return _many(
+            size,
+            object,
+            lambda: Uniform(self, drawn, [Fraction(0), Fraction(1)], width, start, size is not None),
+        )
 
     def integers(
         self, low: Any, high: Any = None, size: Any = None, dtype: Any = np.int64, endpoint: bool = False
@@ -261,7 +281,8 @@ class Branching:
         if isinstance(x, np.ndarray):
             x[...] = x.take(self._order(x.shape[axis]), axis=axis)
         else:
-            x[:] = [x[number] for number in self._order(len(x))]
+            for place, each in enumerate([x[number] for number in self._order(len(x))]):
+                x[place] = each
 
     def _order(self, size: int) -> IntArray:
         return np.array(self._in_turn(_even(size), size), dtype=np.int64)
@@ -314,7 +335,7 @@ def _many(size: Any, dtype: Any, draw: Callable[[], Any]) -> Any:
 
 @lru_cache
 def _even(count: int) -> Weights:
-    return (Fraction(1, count),) * count
+    return (Fraction(1, max(count, 1)),) * count
 
 
 @lru_cache

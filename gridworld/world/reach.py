@@ -16,6 +16,7 @@ import contextlib
 import copy
 import dis
 import importlib
+import io
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodWrapperType, ModuleType
@@ -122,16 +123,18 @@ class Reach:
         self._class(type(owner), is_called=False)
         try:
             self._follow()
+            if skips:
+                self._places = {key: at for key, at in self._places.items() if self._is_readable(*at)}
         except UnreadableError as error:
             called = f"{method}() of {type(owner).__name__}"
             raise InputError(f"{where}: {called} refers to {error}{SO_UNKNOWN}") from None
-        if skips:
-            self._places = {key: at for key, at in self._places.items() if self._is_readable(*at)}
 
     def _is_readable(self, place: Mapping[str, Any], name: str) -> bool:
         try:
             return bool(digest(place.get(name), self._known))
         except UnreadableError:
+            if isinstance(place.get(name), Iterator) and not isinstance(place.get(name), io.IOBase):
+                raise
             return False
 
     def content(self, is_outside: bool = False) -> bytes:

@@ -90,12 +90,17 @@ def imported_name(value: Any) -> str | None:
 
 
 def digest(
-    value: Any, known: Iterable[Any] = (), generators: dict[int, Any] | None = None, kept: Way | None = None
+    value: Any,
+    known: Iterable[Any] = (),
+    generators: dict[int, Any] | None = None,
+    kept: Way | None = None,
+    kinds: bool = False,
 ) -> bytes:
     """16 bytes, equal for equal values.
 
     An object met again is a place in the order. `known` are objects that are not read. The states of random
     generators are read, or the generators put into `generators`. What `kept` says stands for spaces and code.
+    Only with `kinds` numbers of different types, lists, tuples and short arrays differ that hold the same.
     """
     found: list[Any] = []
     waiting = [value]
@@ -103,6 +108,8 @@ def digest(
     while waiting:
         value = waiting.pop()
         kind = type(value)
+        if kinds and kind is not list and (kind is tuple or issubclass(kind, np.ndarray | np.generic)):
+            found.append(str(getattr(value, "dtype", "tuple")))
         if kind in PLAIN:
             found.append(value)
         elif kind is tuple:

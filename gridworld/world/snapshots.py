@@ -103,13 +103,16 @@ class Snapshots:
         attributes.clear()
         attributes.update(_Unpickler(io.BytesIO(snapshot), self._kept).load())
 
-    def key(self, without: Collection[str] = ()) -> bytes:
-        """A digest of the state, but for some attributes; UnreadableError where it cannot be compared."""
+    def key(self, without: Collection[str] = (), kinds: bool = False) -> bytes:
+        """A digest of the state, but for some attributes; UnreadableError where it cannot be compared.
+
+        Without `kinds` a tuple is the same as a list or an array of its numbers, whose steps may differ.
+        """
         if self._read_by is not None:
             return self._digest(self._read_by(self._env))
         attributes = self._attributes(without)
         try:
-            return self._digest([part for item in attributes for part in item])
+            return self._digest([part for item in attributes for part in item], kinds)
         except UnreadableError:
             for name, value in attributes:
                 try:
@@ -134,8 +137,8 @@ class Snapshots:
                 return value
         return None
 
-    def _digest(self, value: Any) -> bytes:
-        return digest(value, self._known(), self._generators, self._kept_value)
+    def _digest(self, value: Any, kinds: bool = False) -> bytes:
+        return digest(value, self._known(), self._generators, self._kept_value, kinds)
 
     def _kept_value(self, value: Any) -> tuple[Any, Sequence[Any]]:
         if id(value) not in self._read:
@@ -156,6 +159,7 @@ class _Pickler(pickle.Pickler):
     def __init__(self, file: io.BytesIO, env: Any, kept: dict[int, Any], replaced: dict[int, Any]) -> None:
         super().__init__(file, protocol=5)
         self._env, self._kept_by_id, self._replaced = env, kept, replaced
+        self._views: dict[int, list[Any]] = {}  # arrays by that whose memory they show
 
     def reducer_override(self, obj: Any) -> Any:  # three times as fast as `persistent_id`
         if id(obj) in self._replaced:
@@ -164,6 +168,11 @@ class _Pickler(pickle.Pickler):
         if obj is not _kept and (obj is self._env or local or isinstance(obj, _KEPT)):
             self._kept_by_id[id(obj)] = obj
             return _kept, (id(obj),)
+        if isinstance(obj, np.ndarray):
+            views = self._views.setdefault(id(obj if obj.base is None else obj.base), [])
+            if any(np.may_share_memory(obj, each) for each in views):
+                raise TypeError("two arrays share memory; hold one of them")
+            views.append(obj)
         return NotImplemented
 
 

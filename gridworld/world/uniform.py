@@ -15,12 +15,14 @@ if TYPE_CHECKING:
     from gridworld.world.branching import Branching
 
 MOST_OUTCOMES = 10_000  # of one draw
+_MOST_SHIFTED = 2**16  # times its width that an interval may be away from 0, where floats are rounded
+_WIDEST = 2**500  # an interval, near which floats overflow
 
 
 class Uniform:
     """`scale` * u + `offset`, where all that is known of u is the interval of [0, 1) that it is in."""
 
-    __slots__ = ("_branching", "_drawn", "_interval", "_offset", "_run", "_scale")
+    __slots__ = ("_branching", "_drawn", "_interval", "_is_numpys", "_offset", "_run", "_scale")
 
     def __init__(
         self,
@@ -29,9 +31,14 @@ class Uniform:
         interval: list[Fraction],
         scale: Fraction,
         offset: Fraction,
+        is_numpys: bool,
     ) -> None:
+        self._is_numpys = is_numpys  # a scalar of numpy's, whose comparisons are numpy's too
         self._branching, self._run, self._drawn = branching, branching.run, drawn
         self._interval, self._scale, self._offset = interval, scale, offset
+        width = abs(scale)
+        if width and not (abs(offset) <= _MOST_SHIFTED * width and 1 <= width * _WIDEST <= _WIDEST**2):
+            self._refuse()
 
     def _refuse(self, *_: Any, **__: Any) -> Any:
         self._branching.refuse(
@@ -42,6 +49,19 @@ class Uniform:
     __eq__ = __ne__ = __abs__ = __pow__ = __rpow__ = __mod__ = __rmod__ = __floordiv__ = _refuse
     __rfloordiv__ = __divmod__ = __rdivmod__ = __rtruediv__ = __ceil__ = __format__ = _refuse
     __reduce_ex__ = _refuse
+    __class__ = property(lambda _: float)  # as one that asks sees it
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return self._refuse()
+
+    def _refuse_narrow(self, other: Any) -> None:
+        """Numpy rounds a random number to fewer bits for one of fewer bits, which shifts the threshold."""
+        if getattr(other, "dtype", None) in _OTHER_FLOATS:
+            self._branching.refuse(
+                f"a random number meets a {other.dtype}, to which it is rounded", "; use float64", self._drawn
+            )
 
     def _among(self, cuts: Sequence[Fraction]) -> Fraction:
         """Split the interval at the cuts that are in it; returns where the part begins that u is in."""
@@ -62,7 +82,9 @@ class Uniform:
         if threshold is self:  # numpy's search compares what it looks for with itself
             return False
         given = np.asarray(threshold)
-        if given.dtype.kind not in "biuf" or self._scale == 0 or np.isnan(given).any():
+        self._refuse_narrow(given)
+        is_number = not isinstance(threshold, list | tuple) and given.dtype.kind in "biuf"
+        if not is_number or self._scale == 0 or np.isnan(given).any():
             self._refuse()
         finite = np.where(np.isfinite(given), given, 0).ravel().tolist()
         cuts = [(Fraction(each) - self._offset) / self._scale for each in finite]
@@ -70,12 +92,15 @@ class Uniform:
         start = self._among([cut for cut, is_not in zip(cuts, infinite, strict=True) if not is_not])
         found = np.array([(cut > start) == (self._scale > 0) for cut in cuts], dtype=np.bool_)
         found = np.where(infinite, given.ravel() > 0, found).reshape(given.shape)
-        return bool(found) if given.ndim == 0 else found
+        if given.ndim:
+            return found
+        return np.bool_(found) if self._is_numpys or isinstance(threshold, _NUMPYS) else bool(found)
 
     __lt__ = __le__ = _is_below  # to be just at a threshold has no probability
 
     def _is_above(self, threshold: Any) -> Any:
-        return np.logical_not(below) if np.ndim(below := self._is_below(threshold)) else not below
+        below = self._is_below(threshold)
+        return np.logical_not(below) if isinstance(below, _NUMPYS) else not below
 
     __gt__ = __ge__ = _is_above
 
@@ -89,7 +114,7 @@ class Uniform:
         return math.floor(self._scale * middle + self._offset)
 
     def __int__(self) -> int:
-        if self._scale * self._interval[0] + self._offset < 0:
+        if min(self._scale * each + self._offset for each in self._interval) < 0:  # not rounded down
             self._refuse()
         return self.__floor__()
 
@@ -100,8 +125,10 @@ class Uniform:
             return self._refuse()
         if not isinstance(other, Real | np.ndarray) or not math.isfinite(other):
             return self._refuse()
+        self._refuse_narrow(other)
         scale, offset = change(Fraction(float(other)))
-        return Uniform(self._branching, self._drawn, self._interval, scale, offset)
+        is_numpys = self._is_numpys or isinstance(other, _NUMPYS)
+        return Uniform(self._branching, self._drawn, self._interval, scale, offset, is_numpys)
 
     def __add__(self, other: Any) -> Any:
         return self._changed(other, lambda number: (self._scale, self._offset + number))
@@ -123,9 +150,11 @@ class Uniform:
 
     __radd__, __rmul__ = __add__, __mul__
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **_: Any) -> Any:
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
         """What numpy makes of it, with an array or a number on either side."""
         name = ufunc.__name__
+        if options:  # such as `out`
+            return self._refuse()
         if method == "__call__" and name in ("floor", "trunc"):
             return np.float64(self.__floor__() if name == "floor" else self.__int__())
         if method != "__call__" or len(inputs) != 2 or name not in _OPERATIONS:
@@ -137,6 +166,8 @@ class Uniform:
         return getattr(other, theirs)(one)
 
 
+_NUMPYS = (np.generic, np.ndarray)
+_OTHER_FLOATS = [np.dtype(each) for each in (np.float16, np.float32, np.longdouble)]
 _OPERATIONS = {  # by the name of numpy's function: for it on the left, and on the right
     "less": ("__lt__", "__gt__"),
     "less_equal": ("__le__", "__ge__"),

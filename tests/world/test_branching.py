@@ -1,7 +1,7 @@
 """Every outcome of a draw with its probability, against numpy's own draws and closed forms."""
 
 import itertools
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Hashable
 from fractions import Fraction
 from math import comb
@@ -18,8 +18,8 @@ DRAWN = 4000
 SHARES = [0.1, 0.2, 0.3, 0.4]
 
 
-def _shuffled(rng: Any) -> Hashable:
-    items = [1, 2, 3]
+def _shuffled(rng: Any, kind: Callable[[Any], Any] = list) -> Hashable:
+    items = kind([1, 2, 3])
     rng.shuffle(items)
     return tuple(items)
 
@@ -59,6 +59,9 @@ DRAWS: dict[str, Callable[[Any], Hashable]] = {
     "shuffle": _shuffled,
     "binomial": lambda rng: int(rng.binomial(3, 0.3)),
     "multinomial": lambda rng: tuple(rng.multinomial(3, [0.2, 0.3, 0.5]).tolist()),
+    "several shuffles": lambda rng: (rng.permutation(0).size, _shuffled(rng)),
+    "a shuffled deque": lambda rng: _shuffled(rng, deque),
+    "an instance": lambda rng: isinstance(rng, np.random.Generator) and isinstance(rng.random(), float),
     "as many as earlier draws say": _until,
 }
 
@@ -102,6 +105,9 @@ def test_probabilities_are_exact() -> None:
         lambda rng: rng.integers(3, dtype=np.int8),
         lambda rng: rng.integers(3, dtype=int),
         lambda rng: rng.binomial(3, 0.5),
+        lambda rng: rng.random() < 0.5,
+        lambda rng: 1 - rng.random() > np.float64(0.5),
+        lambda rng: 2 * rng.random(2)[0] >= 1,
     ],
 )
 def test_types_are_those_of_numpy(draw: Callable[[Any], Any]) -> None:
@@ -117,6 +123,17 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], str]] = {
     "a number in a text": (lambda rng: f"{rng.random():.2f}", "used for more than comparisons"),
     "a root": (lambda rng: np.sqrt(rng.random()), "used for more than comparisons"),
     "two numbers": (lambda rng: rng.random() < rng.random(), "used for more than comparisons"),
+    "a negative whole part": (lambda rng: int(1 - 3 * rng.random()), "used for more than comparisons"),
+    "an array to put it in": (
+        lambda rng: np.less(rng.random(), np.ones(2), out=np.zeros(2, bool)),
+        "used for more than comparisons",
+    ),
+    "what is rounded off": (lambda rng: rng.random() + 1e16 - 1e16 < 0.5, "used for more than comparisons"),
+    "a threshold of 16 bits": (lambda rng: rng.random() < np.float16(0.3), "meets a float16"),
+    "a factor of 32 bits": (lambda rng: rng.random() * np.float32(6) < 1, "meets a float32"),
+    "draws of 32 bits": (lambda rng: rng.random(dtype=np.float32) < 0.3, "of 32 bits"),
+    "a list": (lambda rng: rng.random() < [0.2, 0.5], "used for more than comparisons"),
+    "a method": (lambda rng: rng.random().hex(), "used for more than comparisons"),
     "equality": (lambda rng: rng.random() == 0.5, "used for more than comparisons"),
     "normal": (lambda rng: rng.normal(), r"np_random.normal\(\) has too many outcomes"),
     "poisson": (lambda rng: rng.poisson(2), r"np_random.poisson\(\) has too many outcomes"),

@@ -37,15 +37,19 @@ class Step(NamedTuple):
     truncated: bool
 
 
-def lumped(steps: Sequence[Sequence[Sequence[Step]]]) -> list[int]:
+def lumped(steps: Sequence[Sequence[Sequence[Step]]], apart: Sequence[Any]) -> list[int]:
     """The number of each hidden state's class: states of one class look and pay alike, whatever is done.
 
     They differ in what nothing depends on, such as the colour of a picture; `steps` as in `Beliefs`, where a
-    negative number is an end.
+    negative number is an end; states whose `apart` differs are not of one class.
 
     Reference: K. G. Larsen and A. Skou, Bisimulation through probabilistic testing, 1991.
     """
-    classes, size = [int(bool(rows)) for rows in steps], 0
+    first = dict[Any, int]()
+    classes = [
+        first.setdefault((bool(rows), each), len(first)) for rows, each in zip(steps, apart, strict=True)
+    ]
+    size = 0
     while size < (size := len(set(classes))):
         numbers: dict[Any, int] = {}
         found = []

@@ -23,8 +23,9 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import pickle
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import EnumType
 from fractions import Fraction
@@ -59,6 +60,7 @@ _METHODS = ("step", "reset")  # what is read of them
 _ELSEWHERE = "draws a random number from another generator than self.np_random, so its outcomes are unknown"
 _OVER = -1  # in place of the state in which an episode ends, where there is chance
 _MOST_RUNS = 10_000_000  # of a step or a reset, some minutes
+_WATCHED, _WATCHED_LATER = 100, 1_009  # first runs after which all that is outside is compared; later one of
 _LONGEST_NAME = 60  # of a state that is called by its observation
 
 
@@ -89,7 +91,7 @@ def enumerate_env(
             limit = limit if limit is not None and limit > 0 else None  # -1 is "none" to `gymnasium.make`
             search.explore(limit)
             mdp = search.compiled(limit)
-            found_limit = Replay(search, mdp, make_env(env_id, kwargs)).check()
+            found_limit = Replay(search, mdp, partial(make_env, env_id, kwargs)).check()
             refuse_transformed(f"env.id={env_id}", env)
         except UnreadableError as error:
             raise InputError(
@@ -110,6 +112,7 @@ class State:
 
     number: int
     key: bytes
+    alike: bytes  # its key without types of numbers
     seen: bytes  # a digest of the observation with which it was found
     depth: int  # steps from the start
     copy: bytes  # b"" where it is no longer needed
@@ -144,21 +147,27 @@ class Search:
         self._by_key: dict[bytes, State] = {}
         self._by_copy: dict[bytes, State] = {}  # by a digest of a copy, of which a state may have several
         self._num_bytes = self._num_runs = 0
+        self._outside, self._before = list[Reach](), list[bytes]()
 
     def refusal(self, reason: str) -> InputError:
         """An error that says why there is no table of it."""
         return InputError(f"env.id={self.name}: {reason}")
 
     def _prepare(self) -> None:
-        """Put the generator that branches in place of the environment's own, wherever it holds that."""
-        self._env.reset(seed=0)
+        """Find the starts, with the generator that branches wherever the environment holds its own."""
         own = self._env.np_random  # it is made when it is first asked for
+        self._snapshots.replace(own, self._branching)
+        first = self._snapshots.take()  # before the first reset, which may set what others keep
+        try:
+            self.starts = self._resets(first)
+        except InputError:
+            self._reached()  # which may name the reason
+            raise
         if unknown := [each for each in self.ignore if each not in vars(self._env)]:
             raise InputError(
                 f"env.ignore={list(self.ignore)}: {self.name} has no attribute {unknown[0]}; it has "
                 f"{', '.join(vars(self._env))}"
             )
-        self._snapshots.replace(own, self._branching)
 
     def explore(self, limit: int | None) -> None:
         """Find all states that can be reached, and what every action does there.
@@ -166,10 +175,8 @@ class Search:
         Episodes are over at the step limit. What lies beyond it is kept too if it is little.
         """
         self._prepare()
-        where = f"env.id={self.name}"
-        outside = [Reach(where, self._env, method, [self._branching], skips=True) for method in _METHODS]
-        before = [each.content(is_outside=True) for each in outside]
-        self.starts = self._resets(self._snapshots.take())
+        self._outside = self._reached()
+        self._before = [each.content(is_outside=True) for each in self._outside]
         waiting, size = [self.states[each.following] for each in self.starts], 0
         waiting = list({each.number: each for each in waiting}.values())
         for state in waiting:
@@ -197,17 +204,23 @@ class Search:
                 if not (step.terminated or step.truncated or following.is_open):
                     following.is_open = True
                     waiting.append(following)
+        self._check_outside()
+        self._check_resets(next(each for each in reversed(self.states) if each.copy))
+
+    def _reached(self) -> list[Reach]:
+        where = f"env.id={self.name}"
+        return [Reach(where, self._env, method, [self._branching], skips=True) for method in _METHODS]
+
+    def _check_outside(self) -> None:
         kept = self._snapshots.changed()
-        if kept is not None or [each.content(is_outside=True) for each in outside] != before:
+        if kept is not None or [each.content(is_outside=True) for each in self._outside] != self._before:
             raise self.refusal(
                 f"a step changes {type(kept).__name__ if kept else 'what is outside of its attributes'}, of "
                 "which no copies can be made; hold what changes in attributes: numbers, lists, numpy arrays"
             )
-        self._check_resets(next(each for each in reversed(self.states) if each.copy))
 
     def _resets(self, copy: bytes) -> list[Step]:
         """What a reset leads to from a copy of a state."""
-        before = self._random_states()
 
         def reset() -> tuple[int, bytes, float, bool, bool]:
             self._snapshots.put_back(copy)
@@ -219,10 +232,8 @@ class Search:
                 raise self.refusal("reset() makes another np_random; leave that to super().reset(seed=seed)")
             return *self._state_after(observation, 0), 0.0, False, False
 
-        found = self._merged(reset)
-        if self._random_states() != before:
-            raise self.refusal(f"a reset {_ELSEWHERE}")
-        return found
+        with self._no_other_draws("reset"):
+            return self._merged(reset)
 
     def _check_resets(self, state: State) -> None:
         """A reset must lead to the same from every state."""
@@ -231,8 +242,9 @@ class Search:
         if len(self.states) == size and sorted(found) == sorted(self.starts):
             return
         values: list[dict[str, bytes]] = []
-        for each in (self.states[self.starts[0].following], self.states[found[0].following]):
-            self._snapshots.put_back(each.copy)
+        one, other = ({each.following for each in steps} for steps in (self.starts, found))
+        for each in (min(one - other or one), min(other - one or other)):
+            self._snapshots.put_back(self.states[each].copy)
             values.append(self._snapshots.keys(self.ignore))
         changed = _listed(name for name, each in values[1].items() if each != values[0].get(name))
         raise self.refusal(
@@ -240,15 +252,22 @@ class Search:
             "enumerated from one start; set all of it in reset(), or list irrelevant attributes in env.ignore"
         )
 
-    def _random_states(self) -> Any:
-        return self._snapshots.random_states(), random_states()
+    @contextlib.contextmanager
+    def _no_other_draws(self, what: str) -> Iterator[None]:
+        before = self._snapshots.random_states(), random_states()
+        try:
+            yield
+        finally:  # whatever else is refused
+            if (self._snapshots.random_states(), random_states()) != before:
+                raise self.refusal(f"a {what} {_ELSEWHERE}")
 
     def _tried(self, state: State) -> list[list[Step]]:
         """What each action does in a copy of a state."""
-        before = self._random_states()
-        steps = [self._merged(partial(self._stepped, state, action)) for action in range(self._num_actions)]
-        if self._random_states() != before:
-            raise self.refusal(f"a step {_ELSEWHERE}")
+        actions = range(self._num_actions)
+        with self._no_other_draws("step"):
+            steps = [self._merged(partial(self._stepped, state, action)) for action in actions]
+        if state.number.bit_count() == 1:  # 1, 2, 4, 8 ...
+            self._check_resets(state)
         if state.number % _SAMPLED:
             self._num_bytes -= len(state.copy)
             state.copy = b""
@@ -261,6 +280,8 @@ class Search:
             shown = float(reward), bool(terminated), bool(truncated)
         except Exception as error:  # whatever it raises
             raise self.refusal(f"a step with action {action} fails: {error}") from error
+        if not math.isfinite(shown[0]):
+            raise self.refusal(f"a step with action {action} pays {shown[0]}; must be a finite number")
         return *self._state_after(observation, state.depth + 1, is_over=shown[1]), *shown
 
     def _merged(self, run: Callable[[], tuple[int, bytes, float, bool, bool]]) -> list[Step]:
@@ -270,6 +291,8 @@ class Search:
             sums[result] = sums.get(result, Fraction(0)) + probability
             self._num_runs += 1
             self.is_random |= self._branching.has_drawn
+            if self._num_runs <= _WATCHED or not self._num_runs % _WATCHED_LATER:
+                self._check_outside()
         if self._num_runs > _MOST_RUNS:
             raise self.refusal(f"its random outcomes are more than {_MOST_RUNS:,}, too many to try them all")
         return [Step(probability, *result) for result, probability in sums.items()]
@@ -297,7 +320,7 @@ class Search:
             raise self.refusal(f"its state cannot be copied: {error}") from error
         short = digest(copy)
         if (state := self._by_copy.get(short)) is None:
-            key = self._snapshots.key(self.ignore)
+            key = self._snapshots.key(self.ignore, kinds=True)
             state = self._by_key.get(key) or self._added(key, seen, depth, copy)
             self._by_copy[short] = state
         if state.seen != seen and not self._branching.has_drawn:
@@ -310,7 +333,7 @@ class Search:
 
     def _added(self, key: bytes, seen: bytes, depth: int, copy: bytes) -> State:
         size, (name, place) = 1 + len(self.states), self._named()
-        state = State(size - 1, key, seen, depth, copy, name, place)
+        state = State(size - 1, key, self._snapshots.key(self.ignore), seen, depth, copy, name, place)
         self._by_key[key] = state
         self.states.append(state)
         self._num_bytes += len(copy)
@@ -382,7 +405,6 @@ class Search:
     def compiled(self, limit: int | None) -> Mdp:
         """The world of what was found; a state in which nothing was tried stays as it is."""
         steps = [each.steps for each in self.states]
-        classes = list(range(len(steps)))
         if self.is_random:  # where an episode is over, nothing but the observation matters
             steps = [
                 [
@@ -391,7 +413,8 @@ class Search:
                 ]
                 for rows in steps
             ]
-            classes = lumped(steps)
+        # Else, what differs only in the types of numbers counts as one where the steps are the same.
+        classes = lumped(steps, [None if self.is_random else each.alike for each in self.states])
         members: dict[int, list[State]] = {}
         for state, number in zip(self.states, classes, strict=True):
             members.setdefault(number, []).append(state)

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.utils import seeding
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order
 
 from gridworld.world.mdp import Mdp
-from gridworld.world.reading import digest
-from gridworld.world.snapshots import Snapshots
+from gridworld.world.reading import digest, generator_state
+from gridworld.world.snapshots import Snapshots, random_states
 from gridworld.world.sources.beliefs import Step
 from gridworld.world.sources.table_walk import FALSE_ALARM, evidence
 
 if TYPE_CHECKING:
     from gridworld.world.sources.enumerated import Search
 
-_RESETS, _STEPS, _EPISODES = 8, 3_000, 5  # of the replay, at least
+_RESETS, _STEPS, _EPISODES = 8, 3_000, 5  # of the replay, at least; each of these resets is a new instance's
+_IF_DRAWN = 64  # instead, if making an instance draws random numbers
 _LONGEST = 10_000  # steps of its first episode where the time may be left out; who cuts later has no limit
 _LONG = 500  # of the others
 _COMPARED = 500  # states, where there is chance; observations and rewards all the way
@@ -29,16 +32,18 @@ _SEED = 20_260_101
 class Replay:
     """Walks through an environment, whose steps must be those of its beliefs."""
 
-    def __init__(self, search: Search, mdp: Mdp, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, search: Search, mdp: Mdp, make: Callable[[], gym.Env[Any, Any]]) -> None:
         self._search, self._mdp, self._limit = search, mdp, mdp.max_episode_steps
         self._nodes = search.beliefs.nodes
         self._random = np.random.default_rng(_SEED)
-        self._env, self._snapshots = env, Snapshots(env.unwrapped)
+        self._make = make
+        self._is_drawn = self._made()
         self._steps = 0  # of this episode
         self._num_compared = 0
         self._keys: dict[bytes, bytes] = {}  # of states, by digests of their copies
         self._started = np.zeros(len(search.beliefs.starts))
-        self._counts: dict[tuple[int, int], dict[int, int]] = {}  # of the outcomes of nodes and actions
+        self._counts: dict[tuple[Any, ...], dict[int, int]] = {}  # of outcomes, by rows and what was before
+        self._last: tuple[int, int, int] | None = None  # node, action and outcome of the last step
         rows = [
             (number, each.following)
             for number, node in enumerate(self._nodes)
@@ -49,15 +54,28 @@ class Replay:
         size = len(self._nodes)
         self._moves = csr_array((np.ones(len(rows)), (origins, following)), shape=(size, size))
 
+    def _made(self) -> bool:
+        """Make a new environment, with the wrappers of its id; whether that draws random numbers."""
+        before = random_states()
+        self._env = self._make()
+        own = self._env.unwrapped
+        self._snapshots = Snapshots(own)
+        if (generator := vars(own).get("_np_random")) is None:
+            return random_states() != before
+        fresh, _ = seeding.np_random(own._np_random_seed)
+        return random_states() != before or generator_state(fresh) != generator_state(generator)
+
     def check(self) -> int | None:
-        """Walk the new environment, with the wrappers of its id, to states drawn at random, and close it.
+        """Walk new environments to states drawn at random, and close them.
 
         Returns the step limit: the table's, or what the walks found.
         """
         steps = episodes = 0
         try:
-            for _ in range(_RESETS):
+            for _ in range(_IF_DRAWN if self._is_drawn else _RESETS):
                 self._start()
+                self._env.close()
+                self._is_drawn |= self._made()
             while steps < _STEPS or episodes < _EPISODES:
                 most = _LONGEST if self._search.ignore and not episodes else _LONG
                 self._walk(most, episodes % 3 * _AT_RANDOM)
@@ -92,7 +110,7 @@ class Replay:
     def _start(self) -> int:
         """The node after a reset."""
         observation, _ = self._env.reset(seed=int(self._random.integers(2**31)))
-        self._steps, seen = 0, digest(observation)
+        self._steps, self._last, seen = 0, None, digest(observation)
         shown = [self._nodes[each].seen for _, each in self._search.beliefs.starts]
         place = shown.index(seen) if seen in shown else 0
         node = self._search.beliefs.starts[place][1]
@@ -111,8 +129,10 @@ class Replay:
                 self._compare("outcome", (*shown[1:], "and its observation"), "none such")
             self._compare("reward", shown[1], row[0].reward)
             return row[0]
-        counts = self._counts.setdefault((node, action), {})
-        counts[same[0]] = counts.get(same[0], 0) + 1
+        for key in ((node, action), (node, action, self._last)):
+            counts = self._counts.setdefault(key, {})
+            counts[same[0]] = counts.get(same[0], 0) + 1
+        self._last = node, action, same[0]
         return row[same[0]]
 
     def _check_frequencies(self) -> None:
@@ -129,7 +149,7 @@ class Replay:
         if max(found) > np.log(len(found) / FALSE_ALARM):
             raise self._search.refusal(
                 "its random outcomes are not as frequent as was enumerated, so it draws them in another way "
-                "than by the methods of np_random"
+                "than by the methods of np_random, or remembers more than its state"
             )
 
     def _way_from(self, node: int) -> list[tuple[int, int]]:
@@ -140,8 +160,11 @@ class Replay:
         way: list[tuple[int, int]] = []
         while target != node:
             origin = int(before[target])
-            leading = [target in {each.following for each in row} for row in self._nodes[origin].rows]
-            way.append((leading.index(True), target))
+            rows = self._nodes[origin].rows
+            leading = [
+                number for number, row in enumerate(rows) if target in {each.following for each in row}
+            ]
+            way.append((int(self._random.choice(leading)), target))
             target = origin
         return way[::-1] or [(int(self._random.integers(self._mdp.num_actions)), -1)]
 
@@ -156,7 +179,7 @@ class Replay:
         self._num_compared += 1
         copy = digest(self._snapshots.take())
         if copy not in self._keys:
-            self._keys[copy] = self._snapshots.key(self._search.ignore)
+            self._keys[copy] = self._snapshots.key(self._search.ignore, kinds=True)
         return self._keys[copy]
 
     def _compare(self, what: str, found: Any, expected: Any) -> None:

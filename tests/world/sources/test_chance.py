@@ -1,6 +1,7 @@
 """Random environments become exact worlds, against tables written by hand; what hides chance is refused."""
 
 import itertools
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -396,6 +397,53 @@ def _closure() -> Any:
     return lambda: rng.integers(2)
 
 
+class Kinds(World):
+    """Whether a list or a tuple is held is part of the state: action 1 makes a tuple, which pays once."""
+
+    def begin(self) -> tuple[int, Any]:
+        return 0, [0]
+
+    def move(self, action: int) -> tuple[tuple[int, Any], float, bool]:
+        time, held = self.at
+        drawn = int(self.np_random.integers(3))
+        if time == 2:
+            held = (0,) if action == 1 and drawn == 0 else [0]
+        paid = 10.0 * (time == 59 and action == 1 and isinstance(held, tuple))
+        return (time + 1, held), paid, time == 59
+
+    def show(self) -> int:
+        return self.at[0]  # type: ignore[no-any-return]
+
+
+def test_what_differs_in_type_only_may_differ_in_what_it_does(compiled: Any) -> None:
+    value = Evaluator(compiled(Kinds), 1.0, 60).optimal_value
+    assert value == pytest.approx(10 / 3)
+
+
+_turns = itertools.cycle([0, 1])
+_thread = threading.local()
+
+
+def _in_turn(holder: Any) -> int:
+    """0 and 1, kept where no copy is made."""
+    holder.turn = 1 - getattr(holder, "turn", 0)
+    return int(holder.turn)
+
+
+class _Held:
+    turn = 0
+
+
+def _guess(number: Callable[[World], int]) -> Callable[[World, int], tuple[int, float, bool]]:
+    """A step that pays for a guess of a number, after a draw that only makes it random."""
+    return lambda s, a: (0 * int(s.np_random.integers(2)), float(a == number(s)), False)
+
+
+def _once(s: World) -> int:
+    s.__dict__.setdefault("layout", int(s.np_random.integers(2)))
+    return 0
+
+
 UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
     "a number": (
         {"move": lambda s, a: (0, float(s.np_random.random()), False)},
@@ -477,6 +525,41 @@ UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
     "an early end by chance": (
         {"step": lambda s, a: (0, 0.0, False, bool(s.np_random.random() < 0.5), {})},
         "truncates some episodes earlier",
+    ),
+    "a class attribute that takes turns": (
+        {"move": _guess(lambda s: _in_turn(_Held))},
+        "what is outside of its attributes",
+    ),
+    "an iterator outside": ({"move": _guess(lambda s: next(_turns))}, "refers to a cycle"),
+    "what cannot be read outside": ({"move": _guess(lambda s: _in_turn(_thread))}, "draws otherwise"),
+    "a layout that the first reset draws": (
+        {"begin": _once, "move": _guess(lambda s: s.layout)},  # type: ignore[attr-defined]
+        r"a reset does not always lead to the same state \(in layout\)",
+    ),
+    "a layout drawn when it is made": (
+        {
+            "made": lambda s: setattr(s, "layout", int(s.np_random.integers(2))),
+            "move": lambda s, a: (0, float(a == s.layout), False),
+        },
+        "its state is not the enumerated one",
+    ),
+    "a view of an array": (
+        {
+            "begin": lambda s: s.__dict__.update(grid=(grid := np.zeros(4)), row=grid[1:]) or 0,
+            "move": lambda s, a: (int(s.np_random.integers(2)), 0.0, False),
+        },
+        "two arrays share memory",
+    ),
+    "what a reset leaves": (
+        {
+            "begin": lambda s: getattr(s, "luck", 0) * 0,
+            "move": lambda s, a: (setattr(s, "luck", int(s.np_random.integers(2))) or 0, 0.0, False),
+        },
+        r"a reset does not always lead to the same state \(in luck\)",
+    ),
+    "no reward": (
+        {"move": lambda s, a: (0, [1.0, np.nan][s.np_random.integers(2)], False)},
+        "pays nan; must be a finite",
     ),
     "too many states": (
         {"move": lambda s, a: (s.at + int(s.np_random.integers(2)), 0.0, False), "show": lambda s: 0},
