@@ -71,11 +71,25 @@ def exiting(*numbers: signal.Signals, first: Callable[[int], object] = int) -> I
 
 
 @contextmanager
+def deferring(*numbers: signal.Signals) -> Iterator[None]:
+    """Call the handlers of these signals only after the block. Other threads than the main one call none."""
+    received: list[int] = []
+    own = [number for number in numbers if signal.getsignal(number) is not None]  # None: not Python's
+    if threading.current_thread() is not threading.main_thread():
+        own = []
+    try:
+        with handling(dict.fromkeys(own, lambda number, frame: received.append(number))):
+            yield
+    finally:
+        for number in received:
+            signal.raise_signal(number)
+
+
+@contextmanager
 def blocking(*numbers: signal.Signals) -> Iterator[None]:
     """Deliver these signals to this thread only after the block; a process started in it never gets them."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
-        signal.pthread_sigmask(signal.SIG_BLOCK, numbers)  # calls the handler of one that came just before
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -23,7 +23,7 @@ from typing import Any
 
 from gridworld.base.errors import DISTRIBUTION
 from gridworld.base.safe_read import sha256
-from gridworld.base.signals import blocking
+from gridworld.base.signals import deferring
 from gridworld.config.fields import Effect
 from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import AgentConfig, TrainConfig
@@ -144,9 +144,14 @@ def source_of(tree: Path) -> Source | None:
         environment = {**os.environ, **variables, "GIT_OPTIONAL_LOCKS": "0"}
         command = ["git", "-C", str(tree), *words]
         # A handler that raised within `run` could leave a lock taken for which `run` waits then.
-        with blocking(signal.SIGINT, signal.SIGTERM):
+        with deferring(signal.SIGINT, signal.SIGTERM):
             done = subprocess.run(
-                command, capture_output=True, check=True, timeout=_GIT_SECONDS, env=environment
+                command,
+                capture_output=True,
+                check=True,
+                timeout=_GIT_SECONDS,
+                env=environment,
+                process_group=0,  # a terminal's Ctrl-C is not for git
             )
         return done.stdout
 

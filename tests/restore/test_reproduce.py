@@ -6,6 +6,8 @@ import re
 import shutil
 import signal
 import subprocess
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -282,6 +284,7 @@ def test_a_signal_waits_until_git_has_answered(tmp_path: Path, monkeypatch: pyte
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
     had_answered = []
+    threading.Thread(target=time.sleep, args=(0.4,)).start()  # which may be the one that gets the signal
     with (
         pytest.raises(SystemExit),
         exiting(signal.SIGTERM, first=lambda _: had_answered.append(Path("answered").exists())),
