@@ -44,10 +44,8 @@ _VARIABLES = (
 _GIT_SECONDS = 10
 _PACKAGE = Path(__file__).parents[1]
 _PARTS = ("gridworld", "conf", "scripts", "pyproject.toml")  # of the source tree: what the numbers depend on
-_PLUGINS = (
-    "checking/pytest_plugin.py",
-    "sweeps/hydra_plugin.py",
-)  # elsewhere in a wheel; no number depends on them
+# Files of the package that are elsewhere in a wheel; no number depends on them.
+_PLUGINS = ("checking/pytest_plugin.py", "sweeps/hydra_plugin.py")
 _FIXED = frozenset(Effect) - {Effect.LENGTH, Effect.NOTHING}
 _FOR_ALL_AGENTS = ("python", "gridworld", "gymnasium", "numpy", "scipy")
 
