@@ -281,8 +281,15 @@ def killed_by_rewards(spoilt: Rows, unspoilt: Rows) -> bool:
     return False
 
 
+def named(rows: Rows, fault: Fault) -> tuple[int, dict[str, int]]:
+    """Of a fault's runs that are not certified: how many have the right first cause, and the other causes."""
+    causes = Counter(str(row["cause"]) for row in rows if not row["certified"])
+    right = sum(causes.pop(cause, 0) for cause in (*fault.causes, "error"))
+    return right, dict(causes.most_common())
+
+
 def table(rows: Rows) -> Iterator[str]:
-    """The page's tables, as Markdown."""
+    """The page's tables, as Markdown: the totals, then everything that they are made of."""
     of, probes = defaultdict(list), {}
     for row in rows:
         if row["world"] == "check":
@@ -292,54 +299,54 @@ def table(rows: Rows) -> Iterator[str]:
     by_class = {each.change: probes[each.name] for each in (*SOUND, *CATALOGUE) if each.name in probes}
     totals: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     confusions: Counter[tuple[str, str]] = Counter()
-    yield "| fault | agent | half | runs | spoilt | first cause right | named instead | `check` | rewards |"
-    yield "|---|---|---|--:|--:|--:|---|---|---|"
+    lines = []
     for fault in CATALOGUE:
         mine = of[fault.name]
-        spoilt = [row for row in mine if not row["certified"]]
-        named = Counter(str(row["cause"]) for row in spoilt)
-        right = sum(named[cause] for cause in (*fault.causes, "error"))
-        wrong = {cause: count for cause, count in named.items() if cause not in (*fault.causes, "error")}
-        confusions.update({(fault.causes[0], cause): count for cause, count in wrong.items()})
+        right, instead = named(mine, fault)
+        confusions.update({(fault.causes[0], cause): count for cause, count in instead.items()})
+        spoilt = sum(not row["certified"] for row in mine)
         failed = by_class.get(fault.change)
         is_killed = killed_by_rewards(mine, of[f"sound {fault.agent}"])
-        check = "-" if failed is None else ", ".join(failed) or "passes"
-        instead = ", ".join(f"{cause} {count}" for cause, count in wrong.items())
-        yield (
-            f"| {fault.title} | {half(fault)} | {len(mine)} | {len(spoilt)} | {right} | "
-            f"{instead} | {check} | {'killed' if is_killed else '-'} |"
+        lines.append(
+            f"| {fault.title} | {half(fault)} | {spoilt} of {len(mine)} | {right} | {_listed(instead)} | "
+            f"{'-' if failed is None else len(failed) or '**passes**'} | {'killed' if is_killed else '-'} |"
         )
-        for key in ((fault.source, half(fault)), ("all", half(fault))):
+        for key in ((fault.source, half(fault)), ("all", half(fault)), ("all", "both")):
             totals[key].update(
-                faults=1, runs=len(mine), spoilt=len(spoilt), right=right, classes=failed is not None,
+                faults=1, runs=len(mine), spoilt=spoilt, right=right, classes=failed is not None,
                 check=bool(failed), rewards=is_killed, some=bool(spoilt),
             )  # fmt: skip
-    yield ""
-    yield "| | half | faults | spoiling | runs | spoilt | first cause right | `check` kills | rewards kill |"
+    yield "| | half | faults | spoil a run | runs | spoilt | first cause right | `check` kills | rewards kill |"
     yield "|---|---|--:|--:|--:|--:|--:|--:|--:|"
-    for (source, part), n in sorted(totals.items()):
+    for source, part in sorted(totals, key=lambda key: (key[0] == "all", key)):
+        n = totals[source, part]
         share = f"{n['right']} ({n['right'] / max(n['spoilt'], 1):.0%})"
         yield (
             f"| {source} | {part} | {n['faults']} | {n['some']} | {n['runs']} | {n['spoilt']} | {share} | "
-            f"{n['check']} of {n['classes']} classes | {n['rewards']} of {n['faults']} |"
+            f"{n['check']} of {n['classes']} | {n['rewards']} of {n['faults']} |"
         )
-    yield ""
-    yield "| what was wrong | named instead | runs |"
-    yield "|---|---|--:|"
-    for (cause, instead), count in confusions.most_common():
-        yield f"| {cause} | {instead} | {count} |"
-    yield ""
-    yield "| sound runs | runs | certified | not certified, and the first cause | `implementation` named |"
+    yield "\n| fault | agent | half | spoilt | first cause right | named instead | `check` | rewards |"
+    yield "|---|---|---|--:|--:|---|--:|---|"
+    yield from lines
+    yield "\n| what was wrong | named instead | runs |\n|---|---|--:|"
+    for (cause, other), count in confusions.most_common():
+        yield f"| `{cause}` | `{other}` | {count} |"
+    yield "\n| without a fault | runs | certified | first cause of the others | `implementation` named |"
     yield "|---|--:|--:|---|--:|"
     for fault in (*SOUND, *SHIPPED):
-        mine = of[fault.name]
-        short = Counter(str(row["cause"]) for row in mine if not row["certified"])
-        causes = ", ".join(f"{cause} {count}" for cause, count in short.most_common())
-        certified = sum(row["certified"] for row in mine)
+        _, causes = named(of[fault.name], fault)
+        certified = sum(row["certified"] for row in of[fault.name])
         what = f"`{fault.change}`" if fault in SHIPPED else f"a class derived from {fault.agent.upper()}"
-        yield f"| {what} | {len(mine)} | {certified} | {causes} | {short['implementation']} |"
+        yield (
+            f"| {what} | {len(of[fault.name])} | {certified} | {_listed(causes)} | "
+            f"{causes.get('implementation', 0)} |"
+        )
     took = [row["seconds"] for row in rows] or [0]
-    yield f"\n{len(rows)} trainings, {statistics.median(took):.1f} seconds each at the median."
+    yield f"\n{len(rows)} trainings and checks, {statistics.median(took):.1f} s each at the median."
+
+
+def _listed(causes: dict[str, int]) -> str:
+    return ", ".join(f"`{cause}` {count}" for cause, count in causes.items())
 
 
 def main() -> None:

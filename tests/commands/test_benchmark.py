@@ -81,3 +81,23 @@ def test_rl_zoo_is_given_the_same_steps_of_the_same_world(
     assert "20,000 steps" in row.name
     settings = OmegaConf.load(given["--conf-file"])["GridWorld-v0"]
     assert settings["env_wrapper"] == f"gridworld.{gridworld.OneHotObservation.__name__}"
+
+
+def test_the_page_of_faults_has_every_fault_and_adds_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "docs" / "benchmarks")
+    faults = import_module("faults")
+    page = (ROOT / "docs" / "reference" / "faults.md").read_text("utf-8")
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines()]
+    for part in "AB":
+        mine = [fault for fault in faults.CATALOGUE if faults.half(fault) == part]
+        rows = [row for row in cells if len(row) == 8 and row[2] == part]
+        assert [f"{row[0]} | {row[1]}" for row in rows] == [fault.title for fault in mine]
+        spoilt = sum(int(row[3].partition(" ")[0]) for row in rows)
+        right = sum(int(row[4]) for row in rows)
+        (total,) = (row for row in cells if row[:2] == ["all", part])
+        assert total[5:7] == [str(spoilt), f"{right} ({right / spoilt:.0%})"]
+        assert f"{right} of {spoilt}" in page.replace(f"{right} ({right / spoilt:.0%})", "")
+    assert len({fault.operator for fault in faults.CATALOGUE if fault.source == "RLMutation"}) == 11
+    assert len({fault.operator for fault in faults.CATALOGUE if fault.source == "muPRL"}) == 8
+    programs = {fault.operator for fault in faults.CATALOGUE if fault.source == "DRLinter"}
+    assert len(programs) + len(faults.NOT_EXPRESSED) == 21
