@@ -316,7 +316,7 @@ def table(rows: Rows) -> Iterator[str]:
                 faults=1, runs=len(mine), spoilt=spoilt, right=right, classes=failed is not None,
                 check=bool(failed), rewards=is_killed, some=bool(spoilt),
             )  # fmt: skip
-    yield "| | half | faults | spoil a run | runs | spoilt | first cause right | `check` kills | rewards kill |"
+    yield "| | half | faults | spoil a run | runs | spoilt | first cause right | `check` kills | rewards |"
     yield "|---|---|--:|--:|--:|--:|--:|--:|--:|"
     for source, part in sorted(totals, key=lambda key: (key[0] == "all", key)):
         n = totals[source, part]

@@ -139,13 +139,13 @@ def subject(algorithm: Any, observation: str = "state") -> AgentConfig:
     if "." in name:
         return SB3ClassConfig(name=name, algorithm=name, engine="stock")
     from gridworld.config.compose import compose
-    from gridworld.config.words import conf_folder
+    from gridworld.config.words import conf_folder, meant
 
     known = sorted(file.stem for file in (conf_folder() / "agent").glob("*.yaml"))
     if name not in known:
         raise InputError(
             f"check {name}: must be a train function, e.g. my_agent:train, the import path of a class, e.g. "
-            f"my_package.MyPPO, or a shipped agent, which are {', '.join(known)}"
+            f"my_package.MyPPO, or a shipped agent{meant(name, known) or ', which are ' + ', '.join(known)}"
         )
     return compose([f"agent={name}"]).agent
 

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from gridworld.base.bounds import Bounds, digits
 from gridworld.base.console import CONSOLE, prepare, printing, program, tell_error
@@ -66,11 +66,16 @@ _SHARED: dict[str, dict[str, Any]] = {  # arguments that several commands have
 }
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{self.prog}: {message}; see {self.prog} --help")
+
+
 def parser_of(
     command: str, about: str | None, *shared: str, epilog: str | None = None
 ) -> argparse.ArgumentParser:
     """The parser of a command that has these of the `_SHARED` arguments."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=program(command),
         description=about,
         epilog=epilog,

@@ -286,6 +286,8 @@ def _game(options: argparse.Namespace) -> Game:
     given = {name: getattr(options, name) for name in _WORLD if getattr(options, name) is not None}
     if options.agent is not None and (fixed := [*options.words, *given.keys() & {"num_rows", "num_cols"}]):
         raise InputError(f"{fixed[0]}: with --agent, the world has the size it was trained on")
+    if runs := [word for word in options.words if os.sep in word and "=" not in word]:
+        raise InputError(f"{runs[0]}: is not a setting such as env=cliff; a run is given by --agent")
     words = [*options.words, *(f"--config-dir={each}" for each in options.config_dir)]
     refuse_unclear(words)
     saved = None if options.agent is None else SavedRun(options.agent, options.trust, options.best)

@@ -57,15 +57,18 @@ def main(arguments: Sequence[str]) -> None:
 
 def _page(options: argparse.Namespace) -> str:
     words: list[str] = options.words
-    is_run = (
-        len(words) == 1 and "=" not in words[0] and (Path(words[0]).is_dir() or words[0].endswith(os.sep))
-    )
-    if is_run:
-        return run_page(SavedRun(Path(words[0]), options.trust, options.best))
+    name = words[0] if len(words) == 1 and "=" not in words[0] else ""
+    if os.sep in name and not Path(name).exists():
+        raise InputError(f"{name}: no such run or map file")
+    if name and Path(name).is_dir():
+        return run_page(SavedRun(Path(name), options.trust, options.best))
     if options.best:
         raise InputError("--best: chooses between the models of a run; give the run's folder")
-    if len(words) < 2 and not any("=" in word for word in words):
-        mdp = named_world(words[0] if words else "classic")
+    if options.config_dir:
+        words = [f"env={name}"] if name else words
+        words = [*words, *(f"--config-dir={each}" for each in options.config_dir)]
+    elif name or not words:
+        mdp = named_world(name or "classic")
         return world_page(mdp, GAMMA, mdp.max_episode_steps or STEP_LIMIT)
     refuse_unclear(words)
     config = compose(words)
@@ -82,5 +85,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar="WORLD",
         help="e.g. cliff, my_map.txt, env=maze env.slip=0.1, or runs/2026-...",
     )
+    option("--config-dir", action="append", default=[], help="a folder with your own yaml files")
     option("--out", type=Path, metavar="FILE", help="write the page there (.html), and do not open it")
     return parser
