@@ -195,7 +195,10 @@ class DenseNetworks(_Rows):
                 (weight, _), (of_weight, of_bias) = net[number], gradients[number]
                 inputs = passed[number]
                 if inputs is not None:
-                    of_weight.copy_(torch.bmm(slope.transpose(1, 2), inputs))
+                    pairs = [(slope.transpose(1, 2), inputs)]
+                    if slope.shape[2] == 1:  # which a batch adds up differently on some processors
+                        pairs = list(zip(*(torch.split(each, 1) for each in pairs[0]), strict=True))
+                    of_weight.copy_(torch.cat([torch.bmm(*pair) for pair in pairs]))
                 elif self._states is None:
                     columns = slope if self._met is None else slope[:, self._met]
                     of_weight.copy_(columns.transpose(1, 2))

@@ -195,5 +195,5 @@ def test_tune_shows_what_train_would_run(capsys: pytest.CaptureFixture[str], tmp
     ):
         with pytest.raises(InputError, match=told):
             shows(*words, *more)
-    with pytest.raises(InputError, match="invalid choice: .hydra."):
+    with pytest.raises(InputError, match=r"invalid choice: .hydra."):
         shows(*words, "--cfg", "hydra")
