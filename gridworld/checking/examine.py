@@ -21,12 +21,15 @@ from gridworld.base.bounds import STEP_LIMIT, Bounds, discount
 from gridworld.base.console import aligned
 from gridworld.base.errors import InputError, in_short
 from gridworld.base.user_input import imported
+from gridworld.checking.function import SingleEnv
 from gridworld.checking.sampling import Actions, Env, Replays, generators_restored, replays, sample
 from gridworld.checking.seen import ERROR, EnvFinding, Seen
 from gridworld.checking.symptoms import ALL
 from gridworld.config.compose import named_world
 from gridworld.envs.inspection import world_of
+from gridworld.envs.observations import make_observation
 from gridworld.envs.rollout import wilson_interval
+from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.world.mdp import Mdp
 from gridworld.world.snapshots import Snapshots
 from gridworld.world.sources.enumerated import enumerate_env
@@ -138,8 +141,8 @@ def _subject(env: Any) -> tuple[str, Make, Mdp | None]:
             raise InputError(f"examine {env}: the module {module} has no {name}, nor is that a registered id")
         env = named_world(env)
     if isinstance(env, Mdp):
-        limit = env.max_episode_steps or STEP_LIMIT
-        return env.name, lambda: gym.wrappers.TimeLimit(_WorldEnv(env), limit), env
+        limit, seen = env.max_episode_steps or STEP_LIMIT, make_observation(env, "none")
+        return env.name, lambda: SingleEnv(GridWorldVectorEnv(mdp=env, max_episode_steps=limit), seen), env
     if isinstance(env, gym.Env):
         name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
         try:
@@ -232,29 +235,6 @@ def _affordable(env: Env, cost: int) -> int:
         env.step(actions.pool[0])
     seconds = (time.perf_counter() - began) / tries * getattr(env.action_space, "n", 1) * cost
     return int(np.clip(_SECONDS / seconds, 100, _MOST_STATES))
-
-
-class _WorldEnv(gym.Env[Any, Any]):
-    """A compiled world, one step at a time."""
-
-    def __init__(self, mdp: Mdp) -> None:
-        self._mdp, self._state = mdp, 0
-        self.observation_space = spaces.Discrete(mdp.num_numbers)
-        self.action_space = spaces.Discrete(mdp.num_actions)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[int, dict[str, Any]]:
-        super().reset(seed=seed)
-        self._state = int(self.np_random.choice(self._mdp.num_states, p=self._mdp.start))
-        return int(self._mdp.number[self._state]), {}
-
-    def step(self, action: Any) -> tuple[int, float, bool, bool, dict[str, Any]]:
-        mdp, here = self._mdp, (self._state, int(action))
-        outcome = self.np_random.choice(mdp.probability.shape[2], p=mdp.probability[here])
-        self._state = int(mdp.next_state[(*here, outcome)])
-        reward = float(mdp.reward[(*here, outcome)])
-        return int(mdp.number[self._state]), reward, bool(mdp.terminal[self._state]), False, {}
 
 
 def _facts(seen: Seen) -> Iterator[tuple[str, str]]:

@@ -16,6 +16,8 @@ from gridworld.base.errors import InputError, in_short
 from gridworld.checking.probes import UnmetError
 from gridworld.config.fields import Word
 from gridworld.config.train import AgentConfig
+from gridworld.envs.observations import ObservationTable
+from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.world.chain import as_numbers, policy_of_table
 from gridworld.world.mdp import FloatArray
 
@@ -58,23 +60,31 @@ class FunctionConfig(AgentConfig):
         return FunctionAgent(self, context)
 
 
-class ProbeEnv(gym.Env[Any, Any]):
+class SingleEnv(gym.Env[Any, Any]):
     """A batch of one as a plain Gymnasium environment; `on_step` is called with the steps so far."""
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
-    def __init__(self, context: TrainingContext, on_step: Hook) -> None:
-        self._envs, self._table, self._on_step = context.envs, context.observation, on_step
-        self._envs.reset(seed=context.seed)
-        self.observation_space = self._table.space
-        self.action_space = spaces.Discrete(self._envs.mdp.num_actions, seed=context.seed)
+    def __init__(
+        self,
+        envs: GridWorldVectorEnv,
+        table: ObservationTable,
+        seed: int = 0,
+        on_step: Hook = lambda steps: 0,
+    ) -> None:
+        self._envs, self._table, self._on_step = envs, table, on_step
+        envs.reset(seed=seed)
+        self.np_random = envs.np_random
+        self.observation_space = table.space
+        self.action_space = spaces.Discrete(envs.mdp.num_actions, seed=seed)
         self._steps, self._is_over = 0, True
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
-        states, _ = self._envs.reset(seed=seed)
+        self._envs.np_random = self.np_random
+        states, _ = self._envs.reset()
         self._is_over = False
         return self._table.rows(states)[0], {}
 
@@ -100,8 +110,9 @@ class FunctionAgent:
 
     def learn(self, total_timesteps: int, on_step: Hook) -> None:
         """Call the function, and read what it returns."""
-        config, env = self._config, ProbeEnv(self._context, on_step)
-        returned = config.train(env, total_timesteps, self._context.seed, **config.arguments)
+        config, context = self._config, self._context
+        env = SingleEnv(context.envs, context.observation, context.seed, on_step)
+        returned = config.train(env, total_timesteps, context.seed, **config.arguments)
         try:
             self._snapshot = self._read(returned if isinstance(returned, Mapping) else {"policy": returned})
         except InputError as error:
