@@ -111,7 +111,7 @@ class GymnasiumConfig(EnvConfig):
 
     def step_limit(self, mdp: Mdp) -> int:
         limit, own = super().step_limit(mdp), mdp.max_episode_steps
-        if own is not None and limit > own and mdp.truth.startswith("enumerated"):
+        if own is not None and limit > own and mdp.is_enumerated:
             # the environment itself ends its episodes at its own limit
             raise InputError(
                 f"env.max_episode_steps={limit}: {mdp.name} truncates its episodes after {own} steps; "

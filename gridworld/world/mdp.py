@@ -32,6 +32,7 @@ Table = TypeVar("Table", bound=NDArray[Any])
 # than what counts as 0.
 LEAST_REWARD, MOST_REWARD = 1e-100, 1e100
 EXACT = "exact"  # the `truth` of tables that are given
+ENUMERATED = "enumerated"  # how the `truth` begins of those that trying all actions found
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -70,6 +71,11 @@ class Mdp:
     def num_actions(self) -> int:
         """A."""
         return len(self.action_names)
+
+    @property
+    def is_enumerated(self) -> bool:
+        """Whether all actions were tried to find it, in an environment that ends its own episodes."""
+        return self.truth.startswith(ENUMERATED)
 
     @property
     def default_step_limit(self) -> int | None:

@@ -11,14 +11,13 @@ from gymnasium.utils import seeding
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order
 
-from gridworld.world.mdp import Mdp
 from gridworld.world.reading import digest, generator_state
 from gridworld.world.snapshots import Snapshots, random_states
 from gridworld.world.sources.beliefs import Step
 from gridworld.world.sources.table_walk import FALSE_ALARM, evidence
 
 if TYPE_CHECKING:
-    from gridworld.world.sources.enumerated import Search
+    from gridworld.world.sources.enumerated import Enumerated
 
 _RESETS, _STEPS, _EPISODES = 8, 3_000, 5  # of the replay, at least; each of these resets is a new instance's
 _IF_DRAWN = 64  # instead, if making an instance draws random numbers
@@ -32,16 +31,17 @@ _SEED = 20_260_101
 class Replay:
     """Walks through an environment, whose steps must be those of its beliefs."""
 
-    def __init__(self, search: Search, mdp: Mdp, make: Callable[[], gym.Env[Any, Any]]) -> None:
-        self._search, self._mdp, self._limit = search, mdp, mdp.max_episode_steps
-        self._nodes = search.beliefs.nodes
+    def __init__(self, found: Enumerated, make: Callable[[], gym.Env[Any, Any]]) -> None:
+        self._found, self._search = found, found.search
+        self._mdp, self._limit = found.mdp, found.mdp.max_episode_steps
+        self._nodes = found.beliefs.nodes
         self._random = np.random.default_rng(_SEED)
         self._make = make
         self._is_drawn = self._made()
         self._steps = 0  # of this episode
         self._num_compared = 0
         self._keys: dict[bytes, bytes] = {}  # of states, by digests of their copies
-        self._started = np.zeros(len(search.beliefs.starts))
+        self._started = np.zeros(len(found.beliefs.starts))
         self._counts: dict[tuple[Any, ...], dict[int, int]] = {}  # of outcomes, by rows and what was before
         self._last: tuple[int, int, int] | None = None  # node, action and outcome of the last step
         rows = [
@@ -111,9 +111,9 @@ class Replay:
         """The node after a reset."""
         observation, _ = self._env.reset(seed=int(self._random.integers(2**31)))
         self._steps, self._last, seen = 0, None, digest(observation)
-        shown = [self._nodes[each].seen for _, each in self._search.beliefs.starts]
+        shown = [self._nodes[each].seen for _, each in self._found.beliefs.starts]
         place = shown.index(seen) if seen in shown else 0
-        node = self._search.beliefs.starts[place][1]
+        node = self._found.beliefs.starts[place][1]
         self._compare_state(node, seen)
         self._started[place] += 1
         return node
@@ -137,7 +137,7 @@ class Replay:
 
     def _check_frequencies(self) -> None:
         """Refuse counts that cannot come from the probabilities, by Bayes factors as in `table_walk`."""
-        starts = [[float(probability) for probability, _ in self._search.beliefs.starts]]
+        starts = [[float(probability) for probability, _ in self._found.beliefs.starts]]
         rows = [(each, self._nodes[each[0]].rows[each[1]]) for each in self._counts]
         width = max((len(row) for _, row in rows), default=1)
         counts, chance = np.zeros((2, len(rows), width))
@@ -169,7 +169,7 @@ class Replay:
         return way[::-1] or [(int(self._random.integers(self._mdp.num_actions)), -1)]
 
     def _compare_state(self, node: int, seen: bytes) -> None:
-        possible = self._search.possible(self._nodes[node])
+        possible = self._found.possible(self._nodes[node])
         is_enough = self._search.is_random and self._num_compared >= _COMPARED
         found = not possible or is_enough or self._key() in {each.key for each in possible}
         self._compare("state", (found, seen), (True, self._nodes[node].seen))
