@@ -30,8 +30,8 @@ from gridworld.config.train import TrainConfig
 from gridworld.diagnosis import verdict
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.envs.rendering import Frame
-from gridworld.report.evidence import read_columns
 from gridworld.run import summary as run_summary
+from gridworld.run.curve import read_columns
 from gridworld.run.folder import claimed
 from gridworld.run.reader import check_free, is_started
 from gridworld.training.resume import unfinished_of

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from gridworld.checking.hidden import hidden
 from gridworld.checking.sampling import LONGEST, boxes
 from gridworld.checking.seen import ENDINGS, ERROR, UNLIMITED, WARNING, EnvFinding, Seen
-from gridworld.envs.rollout import wilson_interval
+from gridworld.world.metrics import wilson_interval
 
 _LEAST_REACHED = 1e-3  # of episodes of a random policy that come to the reward
 _LEAST_LEFT = 0.05  # of the first reward under the discount

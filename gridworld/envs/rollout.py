@@ -12,8 +12,7 @@ from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.world.chain import check_policy
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
-
-_Z = 1.959963984540054  # standard deviations of the normal distribution on either side of 95 % of it
+from gridworld.world.metrics import Z_95, wilson_interval
 
 
 @dataclass(frozen=True)
@@ -27,19 +26,6 @@ class Estimate:
     def __str__(self) -> str:
         low, high = (f"{end:.{4 if abs(end) > 999 else 3}g}" for end in (self.low, self.high))
         return f"{self.mean:.4g} [{low}, {high}]"
-
-
-def wilson_interval(count: int, total: int) -> tuple[float, float]:
-    """Wilson's score interval, from 0 to 1, for the share of `count` hits in `total` samples, one or more.
-
-    It is `scipy.stats.binomtest(count, total).proportion_ci(0.95, method="wilson")`, without the second that
-    `scipy.stats` takes to import. Reference: method 3 of R. G. Newcombe, Statistics in Medicine 17, 1998.
-    """
-    share = count / total
-    scale = 2 * (total + _Z**2)
-    centre = (2 * total * share + _Z**2) / scale
-    half_width = _Z / scale * math.sqrt(4 * total * share * (1 - share) + _Z**2)
-    return (0.0 if count == 0 else centre - half_width), (1.0 if count == total else centre + half_width)
 
 
 def _estimate_share(hits: BoolArray) -> Estimate:
@@ -62,8 +48,8 @@ def _estimate_mean(
     count, mean, seen = len(samples), float(samples.mean()), float(np.ptp(samples))
     spread = max(unseen, seen) if seen else unseen_if_equal
     variance = float(samples.var(ddof=1)) / count if count > 1 else math.inf
-    hidden = _Z**2 * spread / (2 * count)
-    half_width = hidden + math.hypot(_Z * variance**0.5, hidden)
+    hidden = Z_95**2 * spread / (2 * count)
+    half_width = hidden + math.hypot(Z_95 * variance**0.5, hidden)
     return Estimate(mean, max(bounds[0], mean - half_width), min(bounds[1], mean + half_width))
 
 

@@ -20,8 +20,9 @@ from gridworld.base.safe_read import sha256
 from gridworld.config.settings import flat, read_config
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig
-from gridworld.report.evidence import ONLINE, Evidence, Unusable, read_columns
+from gridworld.report.evidence import Evidence, Unusable
 from gridworld.report.evidence import read as read_evidence
+from gridworld.run.curve import ONLINE, read_columns
 from gridworld.run.folder import WORLD
 from gridworld.run.reader import LARGEST_RESULT, RunReader, open_run, stored_world
 from gridworld.world.metrics import METRICS

@@ -19,7 +19,6 @@ from gridworld.playground.page import fits, link
 from gridworld.report import statistics
 from gridworld.report.evidence import (
     DAMAGED,
-    ONLINE,
     REPORTED,
     SAMPLED_RETURN,
     Evidence,
@@ -30,6 +29,7 @@ from gridworld.report.evidence import (
 from gridworld.report.grouping import Group, Study, arrange
 from gridworld.report.statistics import Interval, Share
 from gridworld.report.tuning_study import TuningStudy, find_tunings
+from gridworld.run.curve import ONLINE
 from gridworld.run.provenance import versions
 from gridworld.run.reader import read_run, stored_world
 from gridworld.world.evaluation import Evaluator

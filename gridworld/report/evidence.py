@@ -6,7 +6,6 @@ followed, so that a report covers what is in the folder, and the search ends.
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import os
@@ -19,8 +18,8 @@ import numpy as np
 
 from gridworld.base.console import printable
 from gridworld.base.errors import InputError
-from gridworld.base.safe_read import LARGEST_CSV, as_table
 from gridworld.config.settings import NEWER, flat, privileges
+from gridworld.run.curve import ONLINE, REQUIRED, read_columns
 from gridworld.run.folder import CURVE, MANIFEST, SUMMARY, VISITS
 from gridworld.run.reader import RunReader, check_is_folder, read_run
 from gridworld.world.mdp import FloatArray
@@ -28,16 +27,13 @@ from gridworld.world.metrics import METRICS
 
 MOST_ENTRIES = 2_000_000  # files and folders below a given one: some seconds
 DAMAGED = "damaged"
-REQUIRED = ("step", "value", "regret", "certified", "goal_probability", "return")  # columns of a curve
 SAMPLED_RETURN = "sampled_return"
-ONLINE = "online_return"  # undiscounted, of training episodes (`training.learning_curve`); may be empty
 
 # The metrics of which a report has the last value, in the order of its tables.
 _ORDER = ("value", "return", "goal_probability")
 REPORTED = sorted(
     (metric for metric in METRICS if metric.in_report), key=lambda each: (*_ORDER, each.name).index(each.name)
 )
-_MOST_COLUMNS = 100
 _LONGEST_NAME = 80  # characters
 _DIGITS = 9  # after the point: two ways to compute one regret differ later than that
 _KINDS = {str: "a name", int: "a whole number", float: "a number"}
@@ -222,44 +218,4 @@ def _read_curve(run: RunReader) -> dict[str, FloatArray]:
     """The columns that the statistics need: those in `REQUIRED`, and optional ones that the file has."""
     curve = read_columns(run, (*REQUIRED, *(metric.name for metric in REPORTED), SAMPLED_RETURN, ONLINE))
     curve["regret"] = np.maximum(0.0, curve["regret"])  # below zero is rounding
-    return curve
-
-
-def read_columns(run: RunReader, wanted: Sequence[str] | None = None) -> dict[str, FloatArray]:
-    """Read columns (evaluations,) of the learning curve as the run wrote them, NaN where a field is empty.
-
-    `wanted` are names of columns, which the file need not have; None: all that it has. Raises `InputError`
-    where the file is missing, too large, cut off, or holds what no run writes.
-    """
-    path = run.curve_file
-    lines = as_table(run.read(path, LARGEST_CSV), path).splitlines()
-    if lines and lines[0].count(",") >= _MOST_COLUMNS:
-        raise InputError(f"{path}: has more than {_MOST_COLUMNS} columns; was it written by another version?")
-    try:
-        header, *rows = list(csv.reader(lines)) or [[]]
-    except csv.Error as error:
-        raise InputError(f"{path}: is not valid CSV ({error})") from None
-    if not rows:
-        raise InputError(f"{path}: has no rows")
-    if missing := [name for name in REQUIRED if name not in header]:
-        raise InputError(f"{path}: has no column {', '.join(missing)}; was it written by another version?")
-    for line, row in enumerate(rows, 2):
-        if len(row) != len(header):
-            raise InputError(f"{path}: line {line} has {len(row)} of {len(header)} columns; it was cut off")
-    curve: dict[str, FloatArray] = {}
-    for name in header if wanted is None else wanted:
-        if name not in header:
-            continue
-        at = header.index(name)
-        try:
-            curve[name] = np.array([row[at] or "nan" for row in rows], dtype=np.float64)
-        except ValueError as error:
-            raise InputError(f"{path}: {name}: {printable(str(error))}") from None
-        if name != ONLINE and np.isnan(curve[name]).any():
-            raise InputError(f"{path}: {name} is NaN or empty; the run diverged or the file was changed")
-    steps = curve["step"]
-    if steps[0] != 0 or not np.isfinite(steps).all() or (np.diff(steps) <= 0).any():
-        raise InputError(f"{path}: the steps do not increase from 0, row by row")
-    if not np.isin(curve["certified"], (0, 1)).all():
-        raise InputError(f"{path}: certified must be 0 or 1 in every row")
     return curve

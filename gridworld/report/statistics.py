@@ -20,8 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.envs.rollout import wilson_interval
 from gridworld.world.mdp import FloatArray
+from gridworld.world.metrics import wilson_interval
 
 RESAMPLES = 2000
 INFINITE = 1e90  # numbers beyond stand for infinity

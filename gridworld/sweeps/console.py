@@ -21,10 +21,10 @@ from gridworld.base.errors import InputError
 from gridworld.config.fields import Effect
 from gridworld.config.recipe_file import literal
 from gridworld.config.settings import ON_RESULT, effect_of, flat, with_effects
-from gridworld.envs.rollout import wilson_interval
 from gridworld.run.folder import shell_path
 from gridworld.run.reader import read_run
 from gridworld.sweeps.folder import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
+from gridworld.world.metrics import wilson_interval
 
 _HEADINGS = ("agent", "task", "settings", "certified", "median steps")
 _OF_SETTINGS = ON_RESULT - {Effect.SEED, Effect.LABELS, Effect.MACHINE}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import io
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,8 +15,9 @@ from gridworld.base.errors import InputError
 from gridworld.config.presets import fitting_preset, is_world
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.config.words import conf_folder
+from gridworld.run.curve import read_columns
 from gridworld.run.folder import SWEEP_JSON, RunFolder, shell_path
-from gridworld.run.reader import LARGEST_RESULT, RunReader
+from gridworld.run.reader import RunReader
 from gridworld.training.saved_run import SavedRun
 
 _FALLS = 0.95  # of the regret in the quarter of the curve before the last
@@ -78,8 +78,7 @@ def _world_with_recipe(config: TrainConfig) -> str | None:
 
 
 def _still_falls(run: RunReader) -> bool:
-    content = io.BytesIO(run.read(run.curve_file, LARGEST_RESULT))
-    regret = np.genfromtxt(content, delimiter=",", names=True, ndmin=1)["regret"]
+    regret = read_columns(run, ("step", "regret", "certified"))["regret"]
     if len(regret) < _FEWEST or not np.isfinite(regret).all():
         return False
     _, _, before, last = (float(part.mean()) for part in np.array_split(regret, 4))

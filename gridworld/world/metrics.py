@@ -4,12 +4,14 @@ TensorBoard, a line of its charts and of the tables on a terminal. To add a metr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 from gridworld.world.evaluation import Evaluator, Score
 
+Z_95 = 1.959963984540054  # standard deviations of the normal distribution on either side of 95 % of it
 _ROUNDING = 1e-12  # of a regret, which may be below 0 for it
 
 
@@ -138,3 +140,16 @@ def optimal_numbers(evaluator: Evaluator) -> dict[str, float]:
     """What is written of the optimum: {"optimal_value": ..., ...}."""
     best = optimal_score(evaluator)
     return {f"optimal_{metric.name}": metric.of(best) for metric in METRICS if metric.has_optimum}
+
+
+def wilson_interval(count: int, total: int) -> tuple[float, float]:
+    """Wilson's score interval, from 0 to 1, for the share of `count` hits in `total` samples, one or more.
+
+    It is `scipy.stats.binomtest(count, total).proportion_ci(0.95, method="wilson")`, without the second that
+    `scipy.stats` takes to import. Reference: method 3 of R. G. Newcombe, Statistics in Medicine 17, 1998.
+    """
+    share = count / total
+    scale = 2 * (total + Z_95**2)
+    centre = (2 * total * share + Z_95**2) / scale
+    half_width = Z_95 / scale * math.sqrt(4 * total * share * (1 - share) + Z_95**2)
+    return (0.0 if count == 0 else centre - half_width), (1.0 if count == total else centre + half_width)

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from helpers.support import NO_FILES, ROOT, script, train_in
 
+from gridworld.run.curve import REQUIRED
 from gridworld.run.reader import RunReader
 from gridworld.run.summary import circles_text
 from gridworld.training.advice import _still_falls, advice
@@ -44,10 +45,9 @@ def test_more_steps_where_the_regret_still_falls(tmp_path: Path, monkeypatch: py
     words = ["agent=q_learning", "total_timesteps=200", "evaluation.every=20", *NO_FILES]
     _lines(tmp_path / "run", *words)
     for regret, falls in (([0.9] * 8, False), ([0.9] * 6 + [0.5, 0.4], True), ([0.9, 0.1], False)):
-        rows = "".join(f"{step},{each}\n" for step, each in enumerate(regret))
-        monkeypatch.setattr(
-            RunReader, "read", lambda self, path, most, text=rows: f"step,regret\n{text}".encode()
-        )
+        rows = [",".join(REQUIRED), *(f"{step},0,{each},0,0,0" for step, each in enumerate(regret))]
+        content = "\n".join(rows).encode()
+        monkeypatch.setattr(RunReader, "read", lambda self, path, most, content=content: content)
         assert _still_falls(RunReader(tmp_path / "run", {})) == falls
 
 
