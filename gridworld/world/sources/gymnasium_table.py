@@ -232,15 +232,17 @@ def make_env(
             needed = f"needs the package minigrid; install it with {install_command('minigrid')}"
             raise InputError(f"env.id={env_id}: {needed}") from None
     try:
-        gym.spec(registered)
+        spec = gym.spec(registered)
     except Exception as error:  # an id may name a module, which may raise anything
         raise InputError(
             f"env.id={str(env_id)[:80]}: is not registered with Gymnasium ({short_reason(error)}); give a "
             "registered id, e.g. FrozenLake-v1"
         ) from None
+    if render_mode is not None or "render_mode" in spec.kwargs:  # which not every class takes
+        arguments["render_mode"] = render_mode
     try:
         with np.errstate(all="ignore"):
-            return gym.make(env_id, **{"disable_env_checker": True, **arguments, "render_mode": render_mode})
+            return gym.make(env_id, **{"disable_env_checker": True, **arguments})
     except Exception as error:  # as above
         shown = ", ".join(f"{key}: {value}" for key, value in arguments.items())[:100]
         given = f"env.kwargs={{{shown}}}: {env_id}" if arguments else f"env.id={env_id}:"

@@ -254,7 +254,7 @@ class StateSearch:
             self._num_bytes += 0 if array is None else array.nbytes
         if is_over and seen not in self.ends:
             self.ends[seen] = self._named()
-        if is_over and self._branching.has_drawn:
+        if is_over and (self.is_random or self._branching.has_drawn):
             return OVER, seen
         try:
             copy = self._snapshots.take()

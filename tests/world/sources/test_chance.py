@@ -579,3 +579,28 @@ def test_what_is_not_exact_is_refused(compiled: Any, what: str) -> None:
 def test_draws_of_pictures_do_not_matter(compiled: Any) -> None:
     members = {"render": lambda self: self.np_random.normal(), "move": lambda self, action: (0, 1.0, False)}
     assert compiled(type("Drawn", (World,), members)).num_states == 1
+
+
+class SecondCard(gym.Env[Any, int]):
+    """Keep the first of two cards, or take the second, which is shown at the end; no state changes.
+
+    Its class takes no arguments, not even `render_mode`.
+    """
+
+    observation_space = spaces.MultiDiscrete([5, 2])
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.cards = self.np_random.choice(5, size=2, replace=False).tolist()
+        return np.array([self.cards[0], 0]), {}
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return np.array([self.cards[1], 1]), float(self.cards[action]), True, False, {}
+
+
+def test_an_end_may_show_what_nothing_else_does(compiled: Callable[..., Mdp]) -> None:
+    mdp = compiled(SecondCard)
+    best = np.mean([max(first, (10 - first) / 4) for first in range(5)])
+    assert Evaluator(mdp, GAMMA, 1).optimal_value == pytest.approx(best, abs=1e-12)
+    assert mdp.truth == "enumerated, 10 beliefs about 20 hidden states"
