@@ -31,9 +31,8 @@ from gridworld.diagnosis import verdict
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.envs.rendering import Frame
 from gridworld.run import summary as run_summary
-from gridworld.run.curve import read_columns
 from gridworld.run.folder import claimed
-from gridworld.run.reader import check_free, is_started
+from gridworld.run.reader import check_free, is_started, read_columns
 from gridworld.training.resume import unfinished_of
 from gridworld.training.saved_run import SavedRun, read_visits
 from gridworld.training.setup import without_pictures

@@ -63,6 +63,7 @@ _SHARED: dict[str, dict[str, Any]] = {  # arguments that several commands have
     "--policy": {"choices": ("greedy", "sampled"), "default": "greedy", "help": _POLICY},
     "--best": {"action": "store_true", "help": _BEST},
     "--trust": {"action": "store_true", "help": _TRUST},
+    "--config-dir": {"action": "append", "default": [], "help": "a folder with your own yaml files"},
 }
 
 

@@ -262,7 +262,7 @@ def play(game: Game, cell_size: int) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("play", __doc__, "--best", "--trust")
+    parser = parser_of("play", __doc__, "--best", "--trust", "--config-dir")
     option = parser.add_argument
     option(
         "words",
@@ -270,7 +270,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar="env=NAME",
         help="the world, as for train: env=cliff env.slip=0.1, recipe=...",
     )
-    option("--config-dir", action="append", default=[], help="a folder with your own yaml files")
     option("--layout", help="a shipped map's name or a map file (default classic)")
     for name, (kind, meaning) in _WORLD.items():
         option(f"--{name.replace('_', '-')}", type=kind, help=meaning)

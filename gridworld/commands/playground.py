@@ -58,10 +58,10 @@ def main(arguments: Sequence[str]) -> None:
 def _page(options: argparse.Namespace) -> str:
     words: list[str] = options.words
     name = words[0] if len(words) == 1 and "=" not in words[0] else ""
+    if name.endswith(os.sep) or (name and Path(name).is_dir()):
+        return run_page(SavedRun(Path(name), options.trust, options.best))
     if os.sep in name and not Path(name).exists():
         raise InputError(f"{name}: no such run or map file")
-    if name and Path(name).is_dir():
-        return run_page(SavedRun(Path(name), options.trust, options.best))
     if options.best:
         raise InputError("--best: chooses between the models of a run; give the run's folder")
     if options.config_dir:
@@ -77,7 +77,7 @@ def _page(options: argparse.Namespace) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("playground", __doc__, "--best", "--trust")
+    parser = parser_of("playground", __doc__, "--best", "--trust", "--config-dir")
     option = parser.add_argument
     option(
         "words",
@@ -85,6 +85,5 @@ def _parser() -> argparse.ArgumentParser:
         metavar="WORLD",
         help="e.g. cliff, my_map.txt, env=maze env.slip=0.1, or runs/2026-...",
     )
-    option("--config-dir", action="append", default=[], help="a folder with your own yaml files")
     option("--out", type=Path, metavar="FILE", help="write the page there (.html), and do not open it")
     return parser

@@ -68,10 +68,9 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(f"--package {options.package}: shows a part of the configuration; use it with --cfg")
     if importlib.util.find_spec("optuna") is None:
         raise InputError(f"{program('tune')}: optuna is not installed; {install_command('tune')}")
-    own = (options.config_dir,) if options.config_dir is not None else ()
     from gridworld.sweeps.tune.study_spec import compose_study
 
-    spec = compose_study(options.overrides, own)
+    spec = compose_study(options.overrides, tuple(map(Path, options.config_dir)))
     if options.cfg:
         _show(spec, options.cfg, options.package)
         return
@@ -93,10 +92,9 @@ def main(arguments: Sequence[str]) -> None:
 
 def _parser(conf: Path) -> argparse.ArgumentParser:
     about = as_called(__doc__ or "").format(spaces="\n".join(choices(conf / "tune")))
-    parser = parser_of("tune", about, epilog=as_called(_EPILOG))
+    parser = parser_of("tune", about, "--config-dir", epilog=as_called(_EPILOG))
     option = parser.add_argument
     option("overrides", nargs="*", metavar="key=value", help=as_called("settings of train.py and tune.*"))
-    option("--config-dir", type=Path, help="a folder with your own yaml files, in addition to conf/")
     option(
         *("--cfg", "-c"),
         nargs="?",

@@ -30,7 +30,7 @@ from gridworld.agents import Agent, PolicySnapshot
 from gridworld.base.errors import InputError
 from gridworld.config.fields import LINEAR, falls, parse_schedule
 from gridworld.config.train import TrainConfig
-from gridworld.run.curve import read_columns
+from gridworld.run.reader import read_columns
 from gridworld.training.saved_run import SavedRun, read_visits
 from gridworld.world.chain import Chain, discounted_visits, stopping_states
 from gridworld.world.evaluation import Evaluator, Score

@@ -22,9 +22,8 @@ from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig
 from gridworld.report.evidence import Evidence, Unusable
 from gridworld.report.evidence import read as read_evidence
-from gridworld.run.curve import ONLINE, read_columns
 from gridworld.run.folder import WORLD
-from gridworld.run.reader import LARGEST_RESULT, RunReader, open_run, stored_world
+from gridworld.run.reader import LARGEST_RESULT, ONLINE, RunReader, open_run, read_columns, stored_world
 from gridworld.world.metrics import METRICS
 from gridworld.world.sources.arrays import world_bytes
 

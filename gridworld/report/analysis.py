@@ -29,9 +29,8 @@ from gridworld.report.evidence import (
 from gridworld.report.grouping import Group, Study, arrange
 from gridworld.report.statistics import Interval, Share
 from gridworld.report.tuning_study import TuningStudy, find_tunings
-from gridworld.run.curve import ONLINE
 from gridworld.run.provenance import versions
-from gridworld.run.reader import read_run, stored_world
+from gridworld.run.reader import ONLINE, read_run, stored_world
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import GridMdp
 from gridworld.world.mdp import FloatArray

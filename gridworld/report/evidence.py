@@ -19,9 +19,8 @@ import numpy as np
 from gridworld.base.console import printable
 from gridworld.base.errors import InputError
 from gridworld.config.settings import NEWER, flat, privileges
-from gridworld.run.curve import ONLINE, REQUIRED, read_columns
 from gridworld.run.folder import CURVE, MANIFEST, SUMMARY, VISITS
-from gridworld.run.reader import RunReader, check_is_folder, read_run
+from gridworld.run.reader import ONLINE, REQUIRED, RunReader, check_is_folder, read_columns, read_run
 from gridworld.world.mdp import FloatArray
 from gridworld.world.metrics import METRICS
 

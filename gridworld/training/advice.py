@@ -15,9 +15,8 @@ from gridworld.base.errors import InputError
 from gridworld.config.presets import fitting_preset, is_world
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.config.words import conf_folder
-from gridworld.run.curve import read_columns
 from gridworld.run.folder import SWEEP_JSON, RunFolder, shell_path
-from gridworld.run.reader import RunReader
+from gridworld.run.reader import RunReader, read_columns
 from gridworld.training.saved_run import SavedRun
 
 _FALLS = 0.95  # of the regret in the quarter of the curve before the last

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 from helpers.support import NO_FILES, ROOT, script, train_in
 
-from gridworld.run.curve import REQUIRED
-from gridworld.run.reader import RunReader
+from gridworld.run.reader import REQUIRED, RunReader
 from gridworld.run.summary import circles_text
 from gridworld.training.advice import _still_falls, advice
 
