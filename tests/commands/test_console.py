@@ -63,6 +63,12 @@ def test_help_version_and_words_that_are_no_command(
         assert (out, errors) == ("", f"error: gridworld: unknown command {shown}; {advice}\n")
 
 
+def test_the_help_of_train_needs_no_numbers() -> None:
+    code = "from gridworld.commands.train import main; main(['--help']); import sys"
+    light = f"{code}; assert not {{'numpy', 'torch', 'gymnasium'}} & sys.modules.keys()"
+    subprocess.run([sys.executable, "-c", light], check=True, stdout=subprocess.DEVNULL)
+
+
 def test_what_is_typed_and_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["gridworld train", "agent=dqn"])
     assert console.command("report") == console.program("report") == "gridworld report"
