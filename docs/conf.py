@@ -10,7 +10,7 @@ import notebook
 import option_tables
 
 import gridworld
-from gridworld.playground.page import maps_page
+from gridworld.report.playground.page import maps_page
 
 project = "gridworld"
 author = "the gridworld maintainers"

@@ -17,27 +17,11 @@ if TYPE_CHECKING:
     from gridworld.base.serialization import State
     from gridworld.envs.observations import ObservationTable
     from gridworld.envs.statistics_env import StatisticsVectorEnv
-    from gridworld.world.mdp import FloatArray, IntArray
+    from gridworld.world.evaluation import PolicySnapshot
 
 WriteScalars = Callable[[Mapping[str, float], int], None]  # ({tag: value}, environment steps)
 Hook = Callable[[int], int]  # see `Agent.learn`
 SafePoint = Callable[[int], None] | None
-
-
-@dataclass(frozen=True, eq=False)
-class PolicySnapshot:
-    """What an agent has learned about every state at one moment: all that evaluation and pictures need."""
-
-    greedy: IntArray  # (S,), the action of the greedy policy
-    sampled: FloatArray  # (S, A), float64, the action probabilities of the policy that it explores with
-    values: FloatArray  # (S,), float64, its estimate of V
-    q: FloatArray | None = None  # (S, A), float64, its estimate of Q; None where it has none
-
-    def greedy_policy(self) -> FloatArray:
-        """The greedy policy's action probabilities, (S, A)."""
-        from gridworld.world.chain import one_hot_policy  # settings are read without numpy
-
-        return one_hot_policy(self.greedy, self.sampled.shape[1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import Agent, PolicySnapshot
+from gridworld.agents import Agent
 from gridworld.api.settings import Override, words
 from gridworld.base.console import tell
 from gridworld.base.errors import InputError, failure
@@ -39,7 +39,7 @@ from gridworld.training.setup import without_pictures
 from gridworld.training.train import train as train_in
 from gridworld.visualization.files import encode_png
 from gridworld.visualization.picture import Subject, drawer
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator, PolicySnapshot
 
 if TYPE_CHECKING:  # of most runs nothing is drawn
     from PIL import Image

@@ -9,14 +9,13 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from numpy.typing import ArrayLike
 
-from gridworld.agents import PolicySnapshot
 from gridworld.base.bounds import discount
 from gridworld.base.errors import InputError
 from gridworld.config.compose import named_world
 from gridworld.envs.inspection import Task, task_of, world_of
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.world.chain import as_numbers, policy_of_table
-from gridworld.world.evaluation import Evaluator, Score
+from gridworld.world.evaluation import Evaluator, PolicySnapshot, Score
 from gridworld.world.mdp import FloatArray, Mdp
 
 

@@ -1,9 +1,11 @@
-"""Bounds of settings: a number outside raises `InputError` with a sentence on key, number and bounds."""
+"""Numbers of settings: their bounds, outside of which they are refused in a sentence, and rates that fall."""
 
 from __future__ import annotations
 
 import math
+import operator
 from dataclasses import dataclass
+from typing import Any
 
 from gridworld.base.errors import InputError
 
@@ -43,6 +45,18 @@ class Bounds:
         return f"{low} and at most {self.high}" if self.above else f"from {self.low} to {self.high}"
 
 
+@dataclass(frozen=True)
+class Decay:
+    """A rate over training."""
+
+    initial: float  # at the start, finite and not negative
+    power: float  # of the share of training that is left, with which it falls to 0; with 0 it stays
+
+    def at(self, progress: float) -> float:
+        """The rate after this share of training, from 0 to 1."""
+        return float(self.initial * (1 - progress) ** self.power)
+
+
 def discount(key: str, value: float) -> None:
     """Refuse a value outside [0, 1], or one so near to 1 that double precision loses the cost of a step."""
     Bounds(0, 1).check(key, value)
@@ -58,3 +72,14 @@ def digits(text: str) -> str:
     number = float(text)
     is_whole = number.is_integer() and abs(number) <= _LARGEST_EXACT
     return str(int(number)) if is_whole and not text.lstrip("+-").isdecimal() else text
+
+
+def positive_int(what: str, value: Any) -> int:
+    """A whole number of at least 1 as an int; refuses bools, floats and strings."""
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or number < 1:
+        raise InputError(f"{what}={value!r}: must be a whole number of at least 1")
+    return number

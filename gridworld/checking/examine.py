@@ -29,9 +29,9 @@ from gridworld.config.compose import named_world
 from gridworld.envs.inspection import world_of
 from gridworld.envs.observations import make_observation
 from gridworld.envs.vector_env import GridWorldVectorEnv
+from gridworld.world.enumeration.snapshots import Snapshots
 from gridworld.world.mdp import Mdp
 from gridworld.world.metrics import wilson_interval
-from gridworld.world.snapshots import Snapshots
 from gridworld.world.sources.enumerated import enumerate_env
 from gridworld.world.sources.gymnasium_table import make_env
 from gridworld.world.wrappers import step_limit

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from gridworld.agents import Hook, PolicySnapshot, TrainingContext
+from gridworld.agents import Hook, TrainingContext
 from gridworld.base.errors import InputError, in_short
 from gridworld.checking.probes import UnmetError
 from gridworld.config.fields import Word
@@ -19,6 +19,7 @@ from gridworld.config.train import AgentConfig
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.world.chain import as_numbers, policy_of_table
+from gridworld.world.evaluation import PolicySnapshot
 from gridworld.world.mdp import FloatArray
 
 OBSERVATIONS = {"state": "none", "one_hot": "one_hot"}  # kinds of `envs.observations`

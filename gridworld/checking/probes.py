@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from gridworld.agents import PolicySnapshot
 from gridworld.world.chain import Chain
-from gridworld.world.evaluation import Evaluator
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.evaluation import Evaluator, PolicySnapshot
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
-from gridworld.world.solver import backup, solved
+from gridworld.world.solver import solved
 
 TOLERANCE = 0.1  # of a value, relative to the largest number in the world
 LEAST_BEST = 0.99  # share of late steps with a best action

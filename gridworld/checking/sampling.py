@@ -21,9 +21,9 @@ import numpy as np
 from gymnasium import spaces
 
 from gridworld.base.errors import in_short
+from gridworld.world.enumeration.snapshots import Snapshots, random_states
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 from gridworld.world.reading import GENERATORS, UnreadableError, digest, generator_state
-from gridworld.world.snapshots import Snapshots, random_states
 
 Env = gym.Env[Any, Any]
 Play = list[tuple[bytes, float, bool, bool]]  # observation, reward, terminated, truncated; of reset first

@@ -19,9 +19,9 @@ from gridworld.base.errors import InputError, reason
 from gridworld.base.safe_read import check_no_link
 from gridworld.base.user_input import limited
 from gridworld.commands import parser_of
-from gridworld.export.exported_run import read
-from gridworld.export.targets import TARGETS, check_installed
 from gridworld.report.evidence import find_runs
+from gridworld.report.export.exported_run import read
+from gridworld.report.export.targets import TARGETS, check_installed
 from gridworld.run.folder import check_inside, check_writable
 
 

@@ -22,7 +22,7 @@ from gridworld.base.user_input import limited
 from gridworld.commands import parser_of
 from gridworld.config.compose import compose, named_world
 from gridworld.config.words import refuse_unclear
-from gridworld.playground.page import GAMMA, run_page, world_page
+from gridworld.report.playground.page import GAMMA, run_page, world_page
 from gridworld.run.folder import check_inside, check_writable
 from gridworld.training.saved_run import SavedRun
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 import functools
 import math
 import re
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import field, fields, is_dataclass
 from enum import Enum, auto
 from typing import Annotated, Any
 
-from gridworld.base.bounds import Bounds
+from gridworld.base.bounds import Bounds, Decay
 from gridworld.base.errors import InputError
 
 MISSING = "???"  # OmegaConf's sign for a value that has to be given
@@ -110,18 +110,6 @@ Arguments = Annotated[dict[str, Any], Text.ARGUMENTS]
 Kwargs = Annotated[dict[str, Any], Text.KWARGS]
 Schedule = int | float | Word
 WholeNumbers = Annotated[Any, Text.WORD, "a whole number, or lists and dicts of them"]
-
-
-@dataclass(frozen=True)
-class Decay:
-    """A rate over training."""
-
-    initial: float  # at the start, finite and not negative
-    power: float  # of the share of training that is left, with which it falls to 0; with 0 it stays
-
-    def at(self, progress: float) -> float:
-        """The rate after this share of training, from 0 to 1."""
-        return float(self.initial * (1 - progress) ** self.power)
 
 
 def falls(value: object) -> bool:

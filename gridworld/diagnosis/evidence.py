@@ -26,16 +26,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import Agent, PolicySnapshot
+from gridworld.agents import Agent
 from gridworld.base.errors import InputError
 from gridworld.config.fields import LINEAR, falls, parse_schedule
 from gridworld.config.train import TrainConfig
 from gridworld.run.reader import read_columns
 from gridworld.training.saved_run import SavedRun, read_visits
 from gridworld.world.chain import Chain, discounted_visits, stopping_states
-from gridworld.world.evaluation import Evaluator, Score
-from gridworld.world.mdp import BoolArray, FloatArray, Mdp
-from gridworld.world.solver import Solution, backup, pick, solved
+from gridworld.world.evaluation import Evaluator, PolicySnapshot, Score
+from gridworld.world.mdp import BoolArray, FloatArray, Mdp, backup
+from gridworld.world.solver import Solution, pick, solved
 
 _ENOUGH = {False: 3000, True: 500}  # updates, by whether it is an actor-critic
 _MEETINGS = 10  # of a random walk with the goal

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gridworld.base.console import command
 from gridworld.base.errors import InputError
@@ -23,11 +24,8 @@ from gridworld.config.train import TrainConfig
 from gridworld.diagnosis.causes import CAUSES, PHRASES
 from gridworld.diagnosis.causes.objective import recommended_gamma
 from gridworld.diagnosis.evidence import Evidence, Finding, RegretSplit
-from gridworld.envs.rendering import Frame, board_of
 from gridworld.training.saved_run import SavedRun
-from gridworld.visualization.canvas import Canvas, directions, greedy_paths
-from gridworld.visualization.sheet import ORANGES, PAPER, UNREACHABLE, linear
-from gridworld.visualization.state_table import StateTable, table_states
+from gridworld.visualization.maps import draw_regret
 from gridworld.world.evaluation import score_of_optimum
 from gridworld.world.mdp import IntArray, Mdp
 
@@ -181,40 +179,12 @@ def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool, offer: TrainCo
         check_foreign(built, str(saved.run.manifest_file), "--trust")
 
 
-def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:
+def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> NDArray[np.uint8]:
     """Draw the split of a run's regret; `cell_size` in pixels, None: 80, less on large maps."""
-    mdp, cost = found.mdp, np.maximum(found.split.cost, 0.0)
-    cost = np.where(np.isfinite(cost) & (found.cause_of >= 0), cost, 0.0)
+    cost = np.maximum(found.split.cost, 0.0)
     causes = ", ".join(
         f"{each.cause} {share:.0%}" for each, share in zip(found.findings, found.shares, strict=True)
     )
     caption = f"regret {found.split.score.regret:.3g}: {causes}"
-    if not board_of(mdp).panels:  # a world without places: its states in a column, by what they cost
-        places = np.round(cost[:, None] * 1e12 / max(cost.max(), 1e-300)).astype(np.int64)
-        states = table_states(mdp, places)
-        table, scale = StateTable(mdp, states, ["regret"]), linear(ORANGES, cost[states], low=0.0)
-        table.paint(np.where(cost > 0, cost, np.nan)[:, None], scale)
-        table.caption(caption)
-        table.legend(scale, "regret")
-        return table.frame()
-    canvas = Canvas(mdp, cell_size)
-    cost = canvas.board.summed(cost)
-    scale = linear(ORANGES, cost[canvas.board.floor], low=0.0)
-    colours = scale.colours(cost)
-    colours[cost == 0] = PAPER
-    canvas.paint(colours[:, None])
-    canvas.draw_world()
-    ways = directions(mdp)[np.arange(mdp.num_states), found.greedy].tolist()
-    paths = greedy_paths(mdp, found.greedy)
-    canvas.draw_paths(paths, ways, 0.4)
-    costly = (cost > 0) & canvas.board.floor
-    canvas.write_numbers(
-        *(cost[:, None], costly[:, None], colours[:, None], scale.high),
-        canvas.number_size(cost[costly], scale.high, 0.8),
-        lambda state, _: canvas.point(state, 0.5, 0.83),
-        plates=range(mdp.num_states),
-    )
-    canvas.caption(caption)
-    swatches = [*([canvas.path_swatch] if paths else []), *([UNREACHABLE] if canvas.hidden else [])]
-    canvas.legend(scale, "regret", swatches)
-    return canvas.frame()
+    cost = np.where(np.isfinite(cost) & (found.cause_of >= 0), cost, 0.0)
+    return draw_regret(found.mdp, cost, found.greedy, caption, cell_size)

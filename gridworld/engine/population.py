@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gridworld.base.bounds import Decay
 from gridworld.base.console import tell
 from gridworld.base.errors import InputError
 from gridworld.base.serialization import (
@@ -26,7 +27,6 @@ from gridworld.base.serialization import (
     set_generator_state,
 )
 from gridworld.base.together import mixed
-from gridworld.config.fields import Decay
 from gridworld.engine.environments import Environments
 from gridworld.engine.networks import DenseNetworks, Networks, StateNetwork, make_networks
 from gridworld.engine.optimizer import Optimizer

@@ -20,11 +20,12 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from gridworld.base.bounds import positive_int
 from gridworld.base.errors import InputError
 from gridworld.envs import rendering as drawing
 from gridworld.envs.rendering import CELL_SIZE, MARGIN, Colour, Frame, Point
 from gridworld.world.grid import ACTION_NAMES, NUM_ACTIONS, GridMdp, mdp_or_compiled
-from gridworld.world.layout import CLASSIC, NUM_COLS, NUM_ROWS, Cell, Layout, positive_int
+from gridworld.world.layout import CLASSIC, NUM_COLS, NUM_ROWS, Cell, Layout
 from gridworld.world.mdp import Mdp
 
 _log = logging.getLogger("gridworld")

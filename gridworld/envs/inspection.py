@@ -18,12 +18,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.base.bounds import MOST_STEPS, STEP_LIMIT, Bounds
+from gridworld.base.bounds import MOST_STEPS, STEP_LIMIT, Bounds, positive_int
 from gridworld.base.errors import InputError
 from gridworld.envs.observations import KINDS, ObservationTable, TableObservation, make_observation
 from gridworld.envs.rendering import frame_size
 from gridworld.world.grid import GridMdp, compile_mdp
-from gridworld.world.layout import Layout, load, positive_int
+from gridworld.world.layout import Layout, load
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import verified
 from gridworld.world.reach import same

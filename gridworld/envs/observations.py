@@ -27,10 +27,10 @@ from gymnasium.vector import VectorEnv, VectorObservationWrapper
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
+from gridworld.base.bounds import positive_int
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import check_memory
 from gridworld.envs import rendering as drawing
-from gridworld.world.layout import positive_int
 from gridworld.world.mdp import IntArray, Mdp
 
 IMAGE_CELL_SIZE = 8  # pixels; 5x6 cells and their border make 56 x 64, enough for SB3's NatureCNN

@@ -15,13 +15,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from gridworld.base.bounds import STEP_LIMIT
+from gridworld.base.bounds import STEP_LIMIT, positive_int
 from gridworld.base.errors import InputError
 from gridworld.base.serialization import State, StateError, fill, generator_state, set_generator_state
 from gridworld.envs import rendering as drawing
 from gridworld.envs.rendering import CELL_SIZE, Frame
 from gridworld.world.grid import mdp_or_compiled
-from gridworld.world.layout import CLASSIC, NUM_COLS, NUM_ROWS, Layout, positive_int
+from gridworld.world.layout import CLASSIC, NUM_COLS, NUM_ROWS, Layout
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 _RADIX_SORTED = 2**16  # numpy sorts numbers below it in linear time, if they are stored as such

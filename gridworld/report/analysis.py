@@ -15,7 +15,6 @@ import numpy as np
 from gridworld.base.errors import InputError
 from gridworld.config.train import check_bounds
 from gridworld.config.worlds import schema_of
-from gridworld.playground.page import fits, link
 from gridworld.report import statistics
 from gridworld.report.evidence import (
     DAMAGED,
@@ -27,6 +26,7 @@ from gridworld.report.evidence import (
     read,
 )
 from gridworld.report.grouping import Group, Study, arrange
+from gridworld.report.playground.page import fits, link
 from gridworld.report.statistics import Interval, Share
 from gridworld.report.tuning_study import TuningStudy, find_tunings
 from gridworld.run.provenance import versions

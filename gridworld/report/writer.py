@@ -26,9 +26,9 @@ from gridworld.base.console import plain, tell
 from gridworld.base.errors import InputError, reason
 from gridworld.base.safe_read import read_bytes, sha256
 from gridworld.config.train import PICTURES
-from gridworld.playground.page import maps_page
 from gridworld.report import statistics, tables
 from gridworld.report.analysis import MOST_SHOWN, Band, Report, Result, TaskAnalysis, gather
+from gridworld.report.playground.page import maps_page
 from gridworld.report.tables import to_captioned_markdown, to_csv, to_markdown
 from gridworld.run.folder import EVENTS as EVENT_FILE
 from gridworld.run.folder import SUMMARY, check_writable

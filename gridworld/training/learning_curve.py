@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import Agent, PolicySnapshot, WriteScalars
+from gridworld.agents import Agent, WriteScalars
 from gridworld.base.atomic_write import AppendLog
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import csv_text
@@ -26,7 +26,7 @@ from gridworld.base.serialization import State
 from gridworld.config.train import TrainConfig
 from gridworld.envs.statistics_env import NO_EPISODES, Returns, StatisticsVectorEnv
 from gridworld.run.writer import NEEDED
-from gridworld.world.evaluation import Evaluator, Score
+from gridworld.world.evaluation import Evaluator, PolicySnapshot, Score
 from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score, regret_text
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import Agent, PolicySnapshot
+from gridworld.agents import Agent
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import DAMAGED, limited
 from gridworld.config.settings import check_foreign, read_config
@@ -28,7 +28,7 @@ from gridworld.config.worlds import MapConfig
 from gridworld.run.folder import shown
 from gridworld.run.reader import RunReader, open_run, stored_world
 from gridworld.training.setup import make_context
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator, PolicySnapshot
 from gridworld.world.grid import GridMdp
 from gridworld.world.layout import CLASSIC, load
 from gridworld.world.mdp import FloatArray, Mdp

@@ -15,9 +15,9 @@ from gridworld.config.train import AUTO, PICTURES, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
+from gridworld.world.enumeration.memoryless import aliased, cost_of_own_observation
 from gridworld.world.evaluation import REGRET_TOLERANCE, Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
-from gridworld.world.memoryless import aliased, cost_of_own_observation
 
 _QUICKLY_SOLVED = 6000  # outcomes of all states and actions
 

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from gridworld.base.bounds import positive_int
 from gridworld.base.errors import InputError
 from gridworld.envs import rendering as drawing
 from gridworld.envs.rendering import Frame, Packed
 from gridworld.envs.rollout import Episode
-from gridworld.world.layout import positive_int
 from gridworld.world.mdp import IntArray, Mdp
 
 _MOST_COLOURS = 256

@@ -12,7 +12,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import PolicySnapshot
 from gridworld.envs import rendering as drawing
 from gridworld.envs.rendering import (
     AGENT,
@@ -35,6 +34,7 @@ from gridworld.visualization.sheet import (
     ORANGES,
     PAPER,
     UNKNOWN_INK,
+    UNREACHABLE,
     VIRIDIS,
     Scale,
     Sheet,
@@ -44,6 +44,7 @@ from gridworld.visualization.sheet import (
     linear,
 )
 from gridworld.visualization.state_table import StateTable, table_states
+from gridworld.world.evaluation import PolicySnapshot
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 from gridworld.world.solver import Solution, solved
 
@@ -274,3 +275,36 @@ def draw_visit_map(
     scale = counting(BLUES, counts[board.floor])
     numbers = np.where(counts > 0, counts, np.nan)
     return Canvas(mdp, cell_size).draw_numbers(numbers, scale, "visits", "never", caption)
+
+
+def draw_regret(mdp: Mdp, cost: FloatArray, greedy: IntArray, caption: str, cell_size: int | None) -> Frame:
+    """Draw what each state adds to a policy's regret (S,), and the way that its greedy actions take."""
+    if not board_of(mdp).panels:  # a world without places: its states in a column, by what they cost
+        places = np.round(cost[:, None] * 1e12 / max(cost.max(), 1e-300)).astype(np.int64)
+        states = table_states(mdp, places)
+        table, scale = StateTable(mdp, states, ["regret"]), linear(ORANGES, cost[states], low=0.0)
+        table.paint(np.where(cost > 0, cost, np.nan)[:, None], scale)
+        table.caption(caption)
+        table.legend(scale, "regret")
+        return table.frame()
+    canvas = Canvas(mdp, cell_size)
+    cost = canvas.board.summed(cost)
+    scale = linear(ORANGES, cost[canvas.board.floor], low=0.0)
+    colours = scale.colours(cost)
+    colours[cost == 0] = PAPER
+    canvas.paint(colours[:, None])
+    canvas.draw_world()
+    ways = directions(mdp)[np.arange(mdp.num_states), greedy].tolist()
+    paths = greedy_paths(mdp, greedy)
+    canvas.draw_paths(paths, ways, 0.4)
+    costly = (cost > 0) & canvas.board.floor
+    canvas.write_numbers(
+        *(cost[:, None], costly[:, None], colours[:, None], scale.high),
+        canvas.number_size(cost[costly], scale.high, 0.8),
+        lambda state, _: canvas.point(state, 0.5, 0.83),
+        plates=range(mdp.num_states),
+    )
+    canvas.caption(caption)
+    swatches = [*([canvas.path_swatch] if paths else []), *([UNREACHABLE] if canvas.hidden else [])]
+    canvas.legend(scale, "regret", swatches)
+    return canvas.frame()

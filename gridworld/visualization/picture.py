@@ -14,12 +14,11 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import PolicySnapshot
 from gridworld.base.serialization import State
 from gridworld.config.train import TrainConfig
 from gridworld.envs.rendering import Frame
 from gridworld.visualization.animation import Animation
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator, PolicySnapshot
 
 _MOST = 48  # moments of a history
 _MOST_NUMBERS = 5_000_000  # of all moments together: some 25 MB

@@ -21,11 +21,10 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import ArrayLike
 
-from gridworld.base.bounds import discount
+from gridworld.base.bounds import discount, positive_int
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import check_memory
 from gridworld.base.workarounds import blas_threads
-from gridworld.world.layout import positive_int
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, steps_from
 
 ORDINARY_GAMMA = 0.9999  # up to here a plain solution of the linear system is accurate

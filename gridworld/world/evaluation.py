@@ -13,12 +13,26 @@ import numpy as np
 
 from gridworld.base.console import telling_if_slow
 from gridworld.world.chain import Chain, Outcome, one_hot_policy
-from gridworld.world.mdp import FloatArray, Mdp
+from gridworld.world.mdp import FloatArray, IntArray, Mdp
 from gridworld.world.solver import Solution, solved
 
 _USUAL_DISCOUNTS = (0.8, 0.9, 0.95, 0.97, 0.99)
 _QUICKLY_SOLVED = 20_000  # outcomes of all states and actions: a few tenths of a second
 REGRET_TOLERANCE = 1e-6  # relative; a detour of one step costs at least 1 % at the default discount
+
+
+@dataclass(frozen=True, eq=False)
+class PolicySnapshot:
+    """What an agent has learned about every state at one moment: all that evaluation and pictures need."""
+
+    greedy: IntArray  # (S,), the action of the greedy policy
+    sampled: FloatArray  # (S, A), float64, the action probabilities of the policy that it explores with
+    values: FloatArray  # (S,), float64, its estimate of V
+    q: FloatArray | None = None  # (S, A), float64, its estimate of Q; None where it has none
+
+    def greedy_policy(self) -> FloatArray:
+        """The greedy policy's action probabilities, (S, A)."""
+        return one_hot_policy(self.greedy, self.sampled.shape[1])
 
 
 @dataclass(frozen=True, repr=False)

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from gridworld.base.bounds import STEP_LIMIT
+from gridworld.base.bounds import STEP_LIMIT, positive_int
 from gridworld.base.errors import InputError
-from gridworld.world.layout import CLASSIC, MOVES, NUM_COLS, NUM_ROWS, Cell, Layout, load, positive_int
+from gridworld.world.layout import CLASSIC, MOVES, NUM_COLS, NUM_ROWS, Cell, Layout, load
 from gridworld.world.mdp import BoolArray, IntArray, Mdp, checked_reward, finite, frozen, grid_places
 
 ACTION_NAMES = ("up", "right", "down", "left")

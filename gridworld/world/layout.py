@@ -16,14 +16,13 @@ back to.
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
 from os import PathLike, fspath
-from typing import Any
 
+from gridworld.base.bounds import positive_int
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import open_users_file
 
@@ -152,17 +151,6 @@ def shipped_layouts() -> tuple[str, ...]:
     """Names of all layouts that come with the package."""
     maps = (entry.name for entry in files("gridworld").joinpath("layouts").iterdir())
     return tuple(sorted([CLASSIC, *(name.removesuffix(".txt") for name in maps if name.endswith(".txt"))]))
-
-
-def positive_int(what: str, value: Any) -> int:
-    """A whole number of at least 1 as an int; refuses bools, floats and strings."""
-    try:
-        number = None if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        number = None
-    if number is None or number < 1:
-        raise InputError(f"{what}={value!r}: must be a whole number of at least 1")
-    return number
 
 
 def _read(layout: str | PathLike[str]) -> Layout:

@@ -231,3 +231,16 @@ def finite(what: str, value: Any) -> float:
     if not math.isfinite(number):
         raise InputError(f"{what}={str(value)[:50]}: must be a finite number")
     return number
+
+
+def backup(
+    mdp: Mdp, v: FloatArray, gamma: float, states: IntArray | slice = slice(None), magnitude: bool = False
+) -> FloatArray:
+    """Q(s, a) = Σ_k p_k [ r_k + γ v(next_k) ] (n, A) of `states` (n,); `magnitude` takes |r_k| for r_k."""
+    reward = np.abs(mdp.reward[states]) if magnitude else mdp.reward[states]
+    target = reward + gamma * v[mdp.next_state[states]]
+    if target.shape[2] == 1:
+        return target[:, :, 0]
+    possible = mdp.probability[states] > 0  # with γ = 1 an impossible outcome may be worth -inf
+    q: FloatArray = np.einsum("sak,sak->sa", mdp.probability[states], np.where(possible, target, 0.0))
+    return q

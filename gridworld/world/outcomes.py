@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gridworld.base.bounds import positive_int
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import check_memory
-from gridworld.world.layout import positive_int
 from gridworld.world.mdp import (
     LEAST_REWARD,
     MOST_REWARD,

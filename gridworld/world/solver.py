@@ -38,7 +38,7 @@ from gridworld.world.chain import (
     one_hot_policy,
     steps_to,
 )
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup
 
 # Two actions whose values agree to this relative precision are equally good. Rounding stays far below it.
 TIE = 1e-9
@@ -50,19 +50,6 @@ _NOTHING = 1e-290  # a value that has faded so far is 0: the smallest numbers of
 # Relative; less than that is rounding: of elimination without subtractions, of sparse factors, of slopes.
 _VISIBLE, _VISIBLE_IN_LARGE, _SAME_SLOPE = 8e-15, 1e-13, 1e-11
 _KEPT = 1e-10  # relative; a policy that loses more was no improvement
-
-
-def backup(
-    mdp: Mdp, v: FloatArray, gamma: float, states: IntArray | slice = slice(None), magnitude: bool = False
-) -> FloatArray:
-    """Q(s, a) = Σ_k p_k [ r_k + γ v(next_k) ] (n, A) of `states` (n,); `magnitude` takes |r_k| for r_k."""
-    reward = np.abs(mdp.reward[states]) if magnitude else mdp.reward[states]
-    target = reward + gamma * v[mdp.next_state[states]]
-    if target.shape[2] == 1:
-        return target[:, :, 0]
-    possible = mdp.probability[states] > 0  # with γ = 1 an impossible outcome may be worth -inf
-    q: FloatArray = np.einsum("sak,sak->sa", mdp.probability[states], np.where(possible, target, 0.0))
-    return q
 
 
 def pick(table: FloatArray, actions: IntArray) -> FloatArray:

@@ -29,10 +29,10 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError, in_short
-from gridworld.world.mdp import Mdp, checked_reward, frozen
+from gridworld.world.mdp import Mdp, backup, checked_reward, frozen
 from gridworld.world.outcomes import absorbing_states, thresholds_of
 from gridworld.world.reach import SO_UNKNOWN, Reach, asked, same
-from gridworld.world.solver import backup, swept_values
+from gridworld.world.solver import swept_values
 
 NEUTRAL, LIMIT, MEMORY = "neutral", "time limit", "memory"
 _STEPS, _MASKED_STEPS = 500, 2000  # of the copy beside the tables

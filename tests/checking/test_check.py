@@ -12,7 +12,6 @@ from helpers import planted_bugs as bugs
 from stable_baselines3 import A2C, DQN, PPO
 
 import gridworld
-from gridworld.agents import PolicySnapshot
 from gridworld.base.errors import InputError
 from gridworld.checking import probes as expect
 from gridworld.checking import run
@@ -20,6 +19,7 @@ from gridworld.checking.probes import PROBES, Trained
 from gridworld.checking.training import arguments, settings, subject, train
 from gridworld.commands import check as command
 from gridworld.world.chain import one_hot_policy
+from gridworld.world.evaluation import PolicySnapshot
 from gridworld.world.mdp import Mdp
 from gridworld.world.solver import solved
 

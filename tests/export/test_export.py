@@ -21,7 +21,7 @@ from PIL import Image
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import sealed
 from gridworld.commands import export
-from gridworld.export.exported_run import read
+from gridworld.report.export.exported_run import read
 
 NAME, TABLE = "dqn-classic-seed0", "q_learning-classic-seed3"
 
@@ -311,7 +311,7 @@ def test_the_hub_gets_the_tables_of_the_run_and_nothing_of_one_that_was_changed(
 @pytest.mark.parametrize("to", ["wandb", "mlflow"])
 def test_a_missing_package_is_told(to: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place)
-    monkeypatch.setattr("gridworld.export.targets.find_spec", lambda name: None)
+    monkeypatch.setattr("gridworld.report.export.targets.find_spec", lambda name: None)
     told = rf"^--to {to}: {to} is not installed; pip install -e '.*\[{to}\]'$"
     with pytest.raises(InputError, match=told):
         export.main(["runs/dqn", "--to", to, "--out", "nowhere"])

@@ -9,7 +9,7 @@ from helpers.browser import chromium
 from helpers.support import SHORT, train_in
 
 from gridworld.config.compose import named_world
-from gridworld.playground.page import run_page, world_page
+from gridworld.report.playground.page import run_page, world_page
 from gridworld.training.saved_run import SavedRun
 
 

@@ -15,7 +15,7 @@ from gridworld.agents.tabular.td_control import TabularControl, TabularControlCo
 from gridworld.config.compose import named_world
 from gridworld.diagnosis.evidence import split_regret
 from gridworld.envs.observations import make_observation
-from gridworld.playground.page import shipped
+from gridworld.report.playground.page import shipped
 from gridworld.run.reader import read_columns
 from gridworld.training.saved_run import SavedRun, read_visits
 from gridworld.world.chain import Chain, one_hot_policy

@@ -17,7 +17,7 @@ from selenium.webdriver.common.keys import Keys
 from gridworld.base.user_input import called_from
 from gridworld.commands import playground as command
 from gridworld.config.compose import named_world
-from gridworld.playground.page import link, world_page
+from gridworld.report.playground.page import link, world_page
 from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import load, parse
 

@@ -16,7 +16,7 @@ import pytest
 from helpers.support import NO_FILES, SHORT, configure, train_in
 from PIL import Image
 
-from gridworld.agents import Agent, PolicySnapshot
+from gridworld.agents import Agent
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import sealed
 from gridworld.envs.statistics_env import Returns
@@ -25,7 +25,7 @@ from gridworld.training.saved_run import SavedRun
 from gridworld.training.together import run_together
 from gridworld.training.train import train, training
 from gridworld.world.chain import one_hot_policy
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator, PolicySnapshot
 
 FILES = {
     *("manifest.json", "curve.csv", "model.zip", "summary.json", "visits.npy"),

@@ -8,7 +8,6 @@ import pytest
 from helpers.support import SHORT, train_in
 from PIL import Image
 
-from gridworld.agents import PolicySnapshot
 from gridworld.envs.rendering import AGENT, CLIFF, GOAL, TRAP, UNKNOWN, WALL, Frame
 from gridworld.visualization.canvas import Canvas, greedy_paths
 from gridworld.visualization.maps import (
@@ -20,6 +19,7 @@ from gridworld.visualization.maps import (
 )
 from gridworld.visualization.picture import PolicyHistory
 from gridworld.visualization.sheet import BLUES, DISAGREES, ORANGES, VIRIDIS, Scale, counting, linear, short
+from gridworld.world.evaluation import PolicySnapshot
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 from gridworld.world.mdp import Mdp

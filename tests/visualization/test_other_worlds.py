@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gridworld.agents import PolicySnapshot
 from gridworld.base.errors import InputError
 from gridworld.config.train import PICTURES, TrainConfig
 from gridworld.config.worlds import EnvConfig, GymnasiumConfig
@@ -39,7 +38,7 @@ from gridworld.visualization.maps import draw_error_map, draw_policy_map, policy
 from gridworld.visualization.picture import PolicyHistory, Subject, drawer
 from gridworld.visualization.sheet import BLUES, DISAGREES, ORANGES, linear
 from gridworld.visualization.state_table import StateTable, table_states
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator, PolicySnapshot
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load
 from gridworld.world.mdp import IntArray, Mdp

@@ -12,7 +12,7 @@ import pytest
 
 from gridworld.base.errors import InputError
 from gridworld.world import branching
-from gridworld.world.branching import Branching
+from gridworld.world.enumeration.branching import Branching
 
 DRAWN = 4000
 SHARES = [0.1, 0.2, 0.3, 0.4]

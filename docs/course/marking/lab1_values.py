@@ -8,7 +8,8 @@ from gridworld import Evaluator, Mdp, compile_mdp
 from gridworld.grading import Work, WrongAnswerError, exercise
 from gridworld.world.chain import Chain
 from gridworld.world.layout import parse
-from gridworld.world.solver import backup, solved
+from gridworld.world.mdp import backup
+from gridworld.world.solver import solved
 
 MAPS = {
     "a room": "S..T\n.#..\n...G\n",

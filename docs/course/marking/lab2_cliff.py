@@ -10,7 +10,8 @@ from gridworld.diagnosis.evidence import optimum_of_epsilon
 from gridworld.grading import Work, WrongAnswerError, exercise
 from gridworld.world.chain import Chain
 from gridworld.world.layout import parse
-from gridworld.world.solver import backup, solved
+from gridworld.world.mdp import backup
+from gridworld.world.solver import solved
 
 SIZES = ((3, 5), (4, 6))
 GAMMA, EPSILON = 0.95, 0.2

@@ -9,7 +9,8 @@ from gridworld import Evaluator, InputError, Mdp, compile_mdp
 from gridworld.grading import Work, WrongAnswerError, exercise
 from gridworld.world.chain import Chain
 from gridworld.world.layout import classic, parse
-from gridworld.world.solver import backup, solved
+from gridworld.world.mdp import backup
+from gridworld.world.solver import solved
 
 GAMMA = 0.9
 RUNS = {  # as in the sheet

@@ -16,16 +16,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from torch import nn
 
-from gridworld.agents import (
-    Agent,
-    Hook,
-    Learning,
-    PolicySnapshot,
-    SafePoint,
-    TrainingContext,
-    WriteScalars,
-    misfit,
-)
+from gridworld.agents import Agent, Hook, Learning, SafePoint, TrainingContext, WriteScalars, misfit
 from gridworld.agents.sb3.callbacks import RunCallback, check_finite, class_without_state, get_state
 from gridworld.agents.sb3.factory import algorithm_and_arguments, failed, make_callbacks, make_model, unfit
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
@@ -42,6 +33,7 @@ from gridworld.engine.optimizer import ELEMENTWISE
 from gridworld.engine.population import Population, train
 from gridworld.engine.sb3_format import algorithm_of, make_run, model_file, put_weights
 from gridworld.world.chain import one_hot_policy
+from gridworld.world.evaluation import PolicySnapshot
 from gridworld.world.mdp import FloatArray
 
 # A model file holds the optimiser's numbers beside every weight, and what SB3 pickles.

@@ -28,6 +28,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from gridworld.agents import Hook, SafePoint
 from gridworld.agents.sb3.model_file import load_tensors
 from gridworld.agents.sb3.settings import SCHEDULES
+from gridworld.base.bounds import Decay
 from gridworld.base.console import tell
 from gridworld.base.serialization import (
     State,
@@ -39,7 +40,6 @@ from gridworld.base.serialization import (
     set_generator_state,
     set_global_state,
 )
-from gridworld.config.fields import Decay
 from gridworld.engine.population import diverged, log_state, set_log_state
 
 _LIBRARIES = ("stable_baselines3", "sb3_contrib", "torch", "gridworld", "builtins")  # None is no part

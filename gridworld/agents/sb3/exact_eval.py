@@ -34,11 +34,11 @@ from gridworld.envs.observations import KINDS, ObservationTable
 from gridworld.run.folder import BEST_MODEL, EVALUATIONS
 from gridworld.run.writer import write_evaluations
 from gridworld.world.chain import one_hot_policy
+from gridworld.world.enumeration.snapshots import random_states
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray, IntArray
 from gridworld.world.metrics import numbers
 from gridworld.world.reach import same
-from gridworld.world.snapshots import random_states
 from gridworld.world.wrappers import is_discrete
 
 _LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.", "torch.")

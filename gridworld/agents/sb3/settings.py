@@ -7,14 +7,13 @@ from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, Optional
 
-from gridworld.base.bounds import MOST_STEPS, Bounds
+from gridworld.base.bounds import MOST_STEPS, Bounds, Decay
 from gridworld.base.errors import InputError
 from gridworld.config.fields import (
     BOUNDS,
     MOST_KEPT,
     Arguments,
     ClassPath,
-    Decay,
     Effect,
     Schedule,
     WholeNumbers,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import Hook, PolicySnapshot, SafePoint, TrainingContext
+from gridworld.agents import Hook, SafePoint, TrainingContext
 from gridworld.agents.tabular.td_control import (
     TabularAgent,
     TabularConfig,
@@ -26,6 +26,7 @@ from gridworld.base.errors import InputError
 from gridworld.base.serialization import State
 from gridworld.config.fields import Word, privilege
 from gridworld.config.train import AgentConfig
+from gridworld.world.evaluation import PolicySnapshot
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 from gridworld.world.solver import value_iteration
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import Agent, Hook, PolicySnapshot, SafePoint, TrainingContext, misfit
+from gridworld.agents import Agent, Hook, SafePoint, TrainingContext, misfit
 from gridworld.base.bounds import Bounds
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import read_bytes
@@ -33,6 +33,7 @@ from gridworld.base.serialization import (
 from gridworld.base.user_input import npz_arrays, npz_bytes
 from gridworld.config.fields import MOST_KEPT, Effect, Schedule, Word, affects, bounds, parse_schedule, rate
 from gridworld.config.train import AgentConfig, TrainConfig
+from gridworld.world.evaluation import PolicySnapshot
 from gridworld.world.mdp import LEAST_REWARD, MOST_REWARD, FloatArray, IntArray
 
 if TYPE_CHECKING:

@@ -18,8 +18,7 @@ from gridworld.diagnosis.evidence import (
     slower,
     visits_needed,
 )
-from gridworld.world.mdp import BoolArray
-from gridworld.world.solver import backup
+from gridworld.world.mdp import BoolArray, backup
 
 _SPREAD = 0.5  # of the entropy of a uniform policy: above, it has hardly made up its mind
 _FORGOTTEN = 0.05  # of a first value

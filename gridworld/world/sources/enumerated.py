@@ -1,9 +1,11 @@
 """Worlds from Gymnasium environments without a table, enumerated: every action in a copy of every state.
 
-    search    the states and what each action does there; everything that changes is state, the time included
-    draws     a generator in place of the environment's own takes every outcome in turn (`world.branching`)
-    beliefs   what observations leave open of the state (`sources.beliefs`): the states of the world
-    replay    the environment itself beside the table, thousands of steps: any difference is refused
+The steps are modules of `world.enumeration`:
+
+    state_search  the states and what each action does there; all that changes is state, the time included
+    branching     a generator in place of the environment's own takes every outcome in turn
+    beliefs       what observations leave open of the state: the states of the world
+    replay        the environment itself beside the table, thousands of steps: any difference is refused
 
 The replay is for what the search may miss, such as attributes that the user told it to leave out, or a
 wrapper. With attributes that a user names as no part of a state, the claim rests on that, and `truth` says
@@ -30,13 +32,13 @@ import numpy as np
 from gridworld.base.console import telling_if_slow
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import check_memory
+from gridworld.world.enumeration.beliefs import Beliefs, Node, lumped
+from gridworld.world.enumeration.replay import Replay
+from gridworld.world.enumeration.state_search import OVER, Named, State, StateSearch
 from gridworld.world.mdp import ENUMERATED, Mdp
 from gridworld.world.outcomes import MOST_STATES, mdp_from_outcomes
 from gridworld.world.reading import UnreadableError
-from gridworld.world.sources.beliefs import Beliefs, Node, lumped
 from gridworld.world.sources.gymnasium_table import compile_gymnasium, has_table, make_env
-from gridworld.world.sources.replay import Replay
-from gridworld.world.sources.state_search import OVER, Named, State, StateSearch
 from gridworld.world.wrappers import refuse_transformed
 
 

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
 from gridworld.base.errors import InputError
-from gridworld.world.mdp import FloatArray, IntArray, Mdp
+from gridworld.world.mdp import FloatArray, IntArray, Mdp, backup
 from gridworld.world.outcomes import Outcomes
-from gridworld.world.solver import backup
 
 if TYPE_CHECKING:
     import gymnasium as gym

@@ -16,11 +16,11 @@ from helpers.support import configure
 from gridworld.base.errors import InputError
 from gridworld.config.worlds import GymnasiumConfig
 from gridworld.training.setup import notes
+from gridworld.world.enumeration.memoryless import cost_of_own_observation
+from gridworld.world.enumeration.snapshots import Snapshots
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
-from gridworld.world.memoryless import cost_of_own_observation
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
-from gridworld.world.snapshots import Snapshots
 from gridworld.world.sources import beliefs
 from gridworld.world.sources.enumerated import enumerate_env
 from gridworld.world.sources.gymnasium_table import compile_gymnasium

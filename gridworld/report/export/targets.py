@@ -27,7 +27,7 @@ from gridworld.base.errors import InputError, install_command
 from gridworld.base.safe_read import read_object
 from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.envs.registration import ENV_ID
-from gridworld.export.exported_run import ExportedRun
+from gridworld.report.export.exported_run import ExportedRun
 from gridworld.report.tables import Table, to_markdown
 from gridworld.run.folder import WORLD
 from gridworld.world.metrics import METRICS

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError
-from gridworld.world import uniform
+from gridworld.world.enumeration import uniform
+from gridworld.world.enumeration.uniform import MOST_OUTCOMES, Uniform
 from gridworld.world.mdp import IntArray
-from gridworld.world.uniform import MOST_OUTCOMES, Uniform
 
 Result = TypeVar("Result")
 Weights = tuple[Fraction, ...]

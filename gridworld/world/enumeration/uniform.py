@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from gridworld.world.branching import Branching
+    from gridworld.world.enumeration.branching import Branching
 
 MOST_OUTCOMES = 10_000  # of one draw
 _MOST_SHIFTED = 2**16  # times its width that an interval may be away from 0, where floats are rounded

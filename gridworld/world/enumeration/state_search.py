@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import check_memory
-from gridworld.world.branching import Branching
+from gridworld.world.enumeration.beliefs import Step
+from gridworld.world.enumeration.branching import Branching
+from gridworld.world.enumeration.snapshots import Snapshots, random_states
 from gridworld.world.outcomes import MOST_ACTIONS
 from gridworld.world.reach import Reach
 from gridworld.world.reading import UnreadableError, digest
-from gridworld.world.snapshots import Snapshots, random_states
-from gridworld.world.sources.beliefs import Step
 
 _BEYOND = 1_000  # states further than a step limit that are found too, so that a small world is whole
 _DEEPEST = 10_000  # steps from the start

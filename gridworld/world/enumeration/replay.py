@@ -11,9 +11,9 @@ from gymnasium.utils import seeding
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order
 
+from gridworld.world.enumeration.beliefs import Step
+from gridworld.world.enumeration.snapshots import Snapshots, random_states
 from gridworld.world.reading import digest, generator_state
-from gridworld.world.snapshots import Snapshots, random_states
-from gridworld.world.sources.beliefs import Step
 from gridworld.world.sources.table_walk import FALSE_ALARM, evidence
 
 if TYPE_CHECKING:
