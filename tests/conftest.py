@@ -78,18 +78,20 @@ IN_TURN = {
 }
 # What takes more than ten seconds of a processor, the longest first.
 LONG = (
-    *("clusters", "tests/test_docs.py", "sweep/test_sweep_population.py", "sweep/test_sweep.py"),
+    *("clusters", "tests/test_docs.py", "sources/test_chance.py", "commands/test_hostile_runs.py"),
+    *("grading/test_course.py", "checking/test_functions.py", "docs/test_examples.py"),
+    *("diagnosis/test_sabotage.py", "api/test_certificates.py", "config/test_presets.py"),
+    *("sweep/test_sweep_population.py", "sweep/test_sweep.py", "sources/test_enumerated.py"),
     *("tune/test_tune.py", "browsers", "playground", "config/test_recipes.py", "tune/test_tune_parts.py"),
-    *("commands/test_hostile_runs.py", "engine/test_populations.py", "api/test_certificates.py"),
+    "engine/test_populations.py",
     *("report/test_report.py", "config/test_config.py", "commands/test_bad_input.py"),
     *("commands/test_commands.py", "process/test_output.py"),
-    *("diagnosis/test_sabotage.py", "restore/test_reproduce.py", "restore/test_resume.py"),
-    *("checking/test_check.py", "checking/test_functions.py", "restore/test_resume_commands.py"),
+    *("restore/test_reproduce.py", "restore/test_resume.py", "checking/test_check.py"),
+    *("checking/test_examine.py", "api/test_worlds.py", "restore/test_resume_commands.py"),
     "commands/test_train_on_worlds.py",
     *("export/test_export.py", "training/test_training.py"),
     *("agents/sb3/test_custom_code.py", "engine/test_updates.py", "restore/test_resume_states.py"),
-    *("commands/test_console.py", "docs/test_examples.py", "config/test_presets.py"),
-    *("grading/test_course.py", "grading/test_grade.py"),
+    *("commands/test_console.py", "docs/test_site.py", "grading/test_grade.py"),
     *("agents/tabular/test_tabular.py", "process/test_forks.py", "api/test_runs.py", "api/test_sweeps.py"),
 )
 

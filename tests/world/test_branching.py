@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gridworld.base.errors import InputError
-from gridworld.world import branching
+from gridworld.world.enumeration import branching
 from gridworld.world.enumeration.branching import Branching
 
 DRAWN = 4000
@@ -68,8 +68,8 @@ DRAWS: dict[str, Callable[[Any], Hashable]] = {
 
 def outcomes(draw: Callable[[Any], Any]) -> dict[Any, Fraction]:
     rng, found = Branching("env.id=Test-v0"), Counter[Any]()
-    for probability, result in rng.outcomes(lambda: draw(rng)):
-        found[result] += probability  # type: ignore[assignment]
+    for share, result in rng.outcomes(lambda: draw(rng)):
+        found[result] += Fraction(*share)  # type: ignore[assignment]
     return dict(found)  # type: ignore[arg-type]
 
 

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError
 from gridworld.world.enumeration import uniform
-from gridworld.world.enumeration.uniform import MOST_OUTCOMES, Uniform
+from gridworld.world.enumeration.uniform import MOST_OUTCOMES, Uniform, Weights, weights_of
 from gridworld.world.mdp import IntArray
 
 Result = TypeVar("Result")
-Weights = tuple[Fraction, ...]
+Share = tuple[int, int]  # of all outcomes: numerator and denominator, not in lowest terms
 
 _MOST_DRAWS = 500  # of one step; a loop that rejects what it draws may have any number
 MOST_BRANCHES = 100_000  # of one step
@@ -42,7 +42,8 @@ _UNLIKE = (
 class _Decision:
     weights: Weights
     possible: tuple[int, ...]  # the outcomes that have a weight
-    probability: Fraction  # of what was decided before
+    share: Share  # of what was decided before
+    total: int  # of the weights
     pool: list[Any] | None = None  # that a choice was made from
     values: Sequence[Any] = ()  # what it gives, by outcomes
 
@@ -63,12 +64,12 @@ class Branching:
         self._is_running = False
         self._num_results = 0
 
-    def outcomes(self, step: Callable[[], Result]) -> Iterator[tuple[Fraction, Result]]:
-        """Run a step once for each sequence of draws: the probability and the result of each."""
+    def outcomes(self, step: Callable[[], Result]) -> Iterator[tuple[Share, Result]]:
+        """Run a step once for each sequence of draws: the share and the result of each."""
         self._decisions, self._taken = [], []
         for _ in range(MOST_BRANCHES):
             result = self._ran(step)
-            yield self._probability(), result
+            yield self._share(), result
             self._num_results += 1
             if self._num_results <= _REPEATED or self._num_results % _REPEATED == 0:
                 # Once, twice or three times, so that no memory has the same rhythm.
@@ -106,7 +107,7 @@ class Branching:
         return self._place > 0
 
     def decide(self, weights: Weights) -> int:
-        """The number of an outcome, drawn with these probabilities."""
+        """The number of an outcome, drawn with probabilities in proportion to these weights."""
         place = self._place
         if place == len(self._decisions):
             if not self._is_running:
@@ -119,7 +120,7 @@ class Branching:
             possible = tuple(number for number, weight in enumerate(weights) if weight)
             if len(possible) == 1:
                 return possible[0]
-            self._decisions.append(_Decision(weights, possible, self._probability()))
+            self._decisions.append(_Decision(weights, possible, self._share(), sum(weights)))
             self._taken.append(0)
         decision = self._decisions[place]
         if decision.weights is not weights and decision.weights != weights:
@@ -130,11 +131,12 @@ class Branching:
         self._place += 1
         return decision.possible[self._taken[place]]
 
-    def _probability(self) -> Fraction:
+    def _share(self) -> Share:
         if not self._decisions:
-            return Fraction(1)
-        last, taken = self._decisions[-1], self._taken[-1]
-        return last.probability * last.weights[last.possible[taken]]
+            return 1, 1
+        last = self._decisions[-1]
+        numerator, denominator = last.share
+        return numerator * last.weights[last.possible[self._taken[-1]]], denominator * last.total
 
     def _not_repeatable(self) -> InputError:
         return InputError(
@@ -266,9 +268,8 @@ class Branching:
         """Different numbers, each drawn from those that are left."""
         left, found = list(weights), list[int]()
         for _ in range(count):
-            rest = sum(left)
-            found.append(self._among(tuple(each / rest for each in left)))
-            left[found[-1]] = Fraction(0)
+            found.append(self._among(tuple(left)))
+            left[found[-1]] = 0
         return found
 
     def permutation(self, x: Any, axis: int = 0) -> Any:
@@ -335,27 +336,26 @@ def _many(size: Any, dtype: Any, draw: Callable[[], Any]) -> Any:
 
 @lru_cache
 def _even(count: int) -> Weights:
-    return (Fraction(1, max(count, 1)),) * count
+    return (1,) * count
 
 
 @lru_cache
 def _distinct(dtype: str, content: bytes) -> tuple[list[Any], Weights]:
-    """The different elements of an array, each with its share."""
+    """The different elements of an array, and how often each is in it."""
     elements = list(np.frombuffer(content, dtype))
     counts: dict[bytes, list[Any]] = {}
     for each in elements:
         counts.setdefault(each.tobytes(), []).append(each)
-    shares = tuple(Fraction(len(found), len(elements)) for found in counts.values())
-    return [found[0] for found in counts.values()], shares
+    return [found[0] for found in counts.values()], tuple(map(len, counts.values()))
 
 
 def _as_numpy_draws(p: Any) -> Weights:
     """Probabilities as the differences of numpy's running sum."""
     sums = np.cumsum(np.asarray(p, dtype=np.float64))
     edges = [Fraction(0), *(Fraction(each) for each in (sums / sums[-1]).tolist())]
-    return tuple(end - start for start, end in itertools.pairwise(edges))
+    return weights_of(end - start for start, end in itertools.pairwise(edges))
 
 
 @lru_cache
 def _binomial(n: int, p: Fraction) -> Weights:
-    return tuple(math.comb(n, count) * p**count * (1 - p) ** (n - count) for count in range(n + 1))
+    return weights_of(math.comb(n, count) * p**count * (1 - p) ** (n - count) for count in range(n + 1))

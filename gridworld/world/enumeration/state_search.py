@@ -9,6 +9,8 @@ change, and changes outside the attributes.
 from __future__ import annotations
 
 import contextlib
+import functools
+import hashlib
 import itertools
 import math
 import pickle
@@ -16,7 +18,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import EnumType
 from fractions import Fraction
-from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -45,6 +46,7 @@ _MOST_RUNS = 10_000_000  # of a step or a reset, some minutes
 _WATCHED, _WATCHED_LATER = 100, 1_009  # first runs after which all that is outside is compared; later one of
 _LONGEST_NAME = 60  # of a state that is called by its observation
 
+_digest_of_whole = functools.lru_cache(2**16)(digest)  # of tuples, which are the same where they are equal
 Named = tuple[str, tuple[str, int, int] | None]  # what a reader calls a state, and its place
 
 
@@ -207,7 +209,7 @@ class StateSearch:
         """What each action does in a copy of a state."""
         actions = range(self.num_actions)
         with self._no_other_draws("step"):
-            steps = [self._merged(partial(self._stepped, state, action)) for action in actions]
+            steps = [self._merged(functools.partial(self._stepped, state, action)) for action in actions]
         if state.number.bit_count() == 1:  # 1, 2, 4, 8 ...
             self._check_resets(state)
         if state.number % _SAMPLED:
@@ -228,21 +230,27 @@ class StateSearch:
 
     def _merged(self, run: Callable[[], tuple[int, bytes, float, bool, bool]]) -> list[Step]:
         """Its different results, each with its probability."""
-        sums: dict[tuple[int, bytes, float, bool, bool], Fraction] = {}
-        for probability, result in self._branching.outcomes(run):
-            sums[result] = sums.get(result, Fraction(0)) + probability
+        sums: dict[tuple[int, bytes, float, bool, bool], dict[int, int]] = {}  # numerators by denominators
+        for (numerator, denominator), result in self._branching.outcomes(run):
+            shares = sums.setdefault(result, {})
+            shares[denominator] = shares.get(denominator, 0) + numerator
             self._num_runs += 1
             self.is_random |= self._branching.has_drawn
             if self._num_runs <= _WATCHED or not self._num_runs % _WATCHED_LATER:
                 self._check_outside()
         if self._num_runs > _MOST_RUNS:
             raise self.refusal(f"its random outcomes are more than {_MOST_RUNS:,}, too many to try them all")
-        return [Step(probability, *result) for result, probability in sums.items()]
+        totals = {
+            result: sum((Fraction(number, of) for of, number in shares.items()), Fraction(0))
+            for result, shares in sums.items()
+        }
+        return [Step(probability, *result) for result, probability in totals.items()]
 
     def _state_after(self, observation: Any, depth: int, is_over: bool = False) -> tuple[int, bytes]:
         """The number of the state that the environment is in, and a digest of the observation."""
         try:
-            seen = digest(observation)
+            is_whole = type(observation) is tuple and all(type(each) is int for each in observation)
+            seen = (_digest_of_whole if is_whole else digest)(observation)
         except UnreadableError:
             with contextlib.suppress(Exception):
                 pickle.dumps(observation)  # a random number in it is refused with its line
@@ -260,7 +268,7 @@ class StateSearch:
             copy = self._snapshots.take()
         except Exception as error:  # whatever the classes in it raise
             raise self.refusal(f"its state cannot be copied: {error}") from error
-        short = digest(copy)
+        short = hashlib.blake2b(copy, digest_size=16).digest()
         if (state := self._by_copy.get(short)) is None:
             key = self._snapshots.key(self.ignore, kinds=True)
             state = self._by_key.get(key) or self._added(key, seen, depth, copy)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from numbers import Real
 from typing import TYPE_CHECKING, Any
@@ -14,9 +14,18 @@ import numpy as np
 if TYPE_CHECKING:
     from gridworld.world.enumeration.branching import Branching
 
+Weights = tuple[int, ...]  # of outcomes, in proportion to their probabilities
+
 MOST_OUTCOMES = 10_000  # of one draw
 _MOST_SHIFTED = 2**16  # times its width that an interval may be away from 0, where floats are rounded
 _WIDEST = 2**500  # an interval, near which floats overflow
+
+
+def weights_of(probabilities: Iterable[Fraction]) -> Weights:
+    """Probabilities as whole numbers, by their common denominator."""
+    found = list(probabilities)
+    common = math.lcm(*(each.denominator for each in found))
+    return tuple(each.numerator * (common // each.denominator) for each in found)
 
 
 class Uniform:
@@ -72,8 +81,7 @@ class Uniform:
         if len(edges) > 2:
             if len(edges) > MOST_OUTCOMES:
                 self._refuse()
-            weights = tuple((end - start) / (high - low) for start, end in itertools.pairwise(edges))
-            part = self._branching.decide(weights)
+            part = self._branching.decide(weights_of(end - start for start, end in itertools.pairwise(edges)))
             self._interval[:] = edges[part : part + 2]
         return self._interval[0]
 

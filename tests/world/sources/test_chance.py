@@ -16,12 +16,12 @@ from helpers.support import configure
 from gridworld.base.errors import InputError
 from gridworld.config.worlds import GymnasiumConfig
 from gridworld.training.setup import notes
+from gridworld.world.enumeration import beliefs
 from gridworld.world.enumeration.memoryless import cost_of_own_observation
 from gridworld.world.enumeration.snapshots import Snapshots
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
-from gridworld.world.sources import beliefs
 from gridworld.world.sources.enumerated import enumerate_env
 from gridworld.world.sources.gymnasium_table import compile_gymnasium
 
@@ -266,6 +266,34 @@ def test_blackjack_with_few_cards_is_as_good_as_by_its_rules(
     assert ("observations stand for several of them" in mdp.truth) == sab
     assert mdp.own_observation is not None
     assert mdp.own_observation.shape == (mdp.num_states, 3)
+
+
+@pytest.mark.parametrize("more", [{}, {"nested": [[1], (2, [3.0])]}], ids=["by marshal", "by pickle"])
+def test_a_copy_is_put_back_as_it_was(more: dict[str, Any]) -> None:
+    env, shared = World(), [4, 5]
+    plain = {"whole": 1, "yes": True, "one": 1.0, "minus": -0.0, "text": "é", "none": None, "pair": (1, 1.0)}
+    numpys = {"n": np.int64(3), "b": np.bool_(1), "m": np.float32(-0.0), "s": np.str_("ab"), "u": np.uint8(3)}
+    lists = {"cards": [1, True, "x"], "one_of_two": shared} | ({"other": shared} if more else {})
+    vars(env).update(plain | numpys | lists | more)
+    snapshots, before = Snapshots(env), dict(vars(env))
+    snapshots.take()  # what is kept as it is, such as a space, is known from here on
+    copy = snapshots.take()
+    assert copy.startswith(b"[") != bool(more)
+    env.cards.append(7)
+    env.n, env.new = np.int64(8), 1
+    snapshots.put_back(copy)
+    found = vars(env)
+    env.cards.append(8)  # a copy is not changed by what happens to what was made of it
+    snapshots.put_back(copy)
+    before["cards"] = [1, True, "x"]
+    assert [*found] == [*before]
+    assert {name: (type(each), repr(each)) for name, each in found.items()} == {
+        name: (type(each), repr(each)) for name, each in before.items()
+    }
+    assert found["action_space"] is before["action_space"]
+    assert not more or found["one_of_two"] is found["other"]
+    env.other = env.one_of_two  # two names of one list are not two lists
+    assert not snapshots.take().startswith(b"[")
 
 
 def test_hands_are_summed_up_only_as_the_known_source_reads_them(monkeypatch: pytest.MonkeyPatch) -> None:
