@@ -31,6 +31,7 @@ from stable_baselines3.common.vec_env import (
 import gridworld
 from gridworld import InputError
 from gridworld.envs.inspection import task_of
+from gridworld.world import wrappers as wrapped
 
 DRAWS = np.random.default_rng(0)  # a generator that wrappers reach as a global
 BEST = np.array([1, 2, 1, 0, 1, 0, 1, 0, 2, 1, 1, 0, 0, 2, 2, 0])  # on the dry lake
@@ -212,6 +213,26 @@ def test_the_score_of_a_table_is_what_it_earns_through_wrappers(world: str, kind
         assert all(gridworld.evaluate(table, batch) == score for batch in vectors)
     best = gridworld.Evaluator(gridworld.compile_env(env), 0.99, 100).optimal_policy()
     assert gridworld.evaluate(best, env).certified
+
+
+@pytest.mark.parametrize(
+    ("kind", "lie"),
+    [
+        ("costs", lambda paid: [each - 0.5 for each in paid]),
+        ("turned actions", lambda chosen: chosen[::-1]),
+    ],
+)
+@pytest.mark.parametrize("world", ["lake", "slippery grid", "cliff"])
+def test_tables_that_differ_from_steps_are_refused(
+    world: str, kind: str, lie: Callable[[list[Any]], list[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What wrappers were asked is compared with what a copy does, should the asking ever be wrong."""
+    env, ask = COMPILED[kind](WORLDS[world]()), wrapped.asked
+    table = np.zeros(env.unwrapped.observation_space.n, dtype=int)
+    gridworld.evaluate(table, env)
+    monkeypatch.setattr(wrapped, "asked", lambda *given: lie([*ask(*given)]))
+    with pytest.raises(InputError, match=r"led to state \d+ with reward .*, which differs from what reward"):
+        gridworld.evaluate(table, env)
 
 
 @pytest.mark.parametrize("kind", UNKNOWN)
