@@ -291,8 +291,9 @@ def _alike(name: str, key: str, others: set[str]) -> str:
 
 
 def meant(key: str, known: list[str]) -> str:
-    """The names that `key` looks like, or is the initials of, as a question; "" if there is none."""
-    return _or(_similar(key, known))
+    """The names that `key` looks like, is the initials or the end of, as a question; "" if there is none."""
+    longer = [name for name in known if name.endswith(key) and len(key) > 3]
+    return _or(_similar(key, known) or longer)
 
 
 def _similar(key: str, known: list[str], n: int = 3, cutoff: float = 0.6) -> list[str]:
