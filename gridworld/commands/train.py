@@ -33,7 +33,14 @@ from gridworld.base.user_input import called_from, limited
 from gridworld.commands.manual import manual
 from gridworld.config.compose import VERSION_BASE, completed, register_schemas, to_config
 from gridworld.config.train import TrainConfig
-from gridworld.config.words import conf_folder, own_conf_folders, refuse_unclear, sentence, unreadable_file
+from gridworld.config.words import (
+    conf_folder,
+    is_override,
+    own_conf_folders,
+    refuse_unclear,
+    sentence,
+    unreadable_file,
+)
 from gridworld.run.folder import MANIFEST, SWEEP_JSON, alone_in, check_inside, claimed, shell_path
 from gridworld.run.reader import check_free, check_is, is_started
 
@@ -90,7 +97,11 @@ def _prepare_command_line() -> None:
         from gridworld.config.recipe_file import with_recipe
 
         sys.argv[1:] = with_recipe(sys.argv[1:])
-    sys.argv[1:] = completed(sys.argv[1:])
+    words = completed(sys.argv[1:])
+    places = [at for at, _ in enumerate(words) if is_override(words, at)]
+    if places and places[-1] - places[0] >= len(places):  # Hydra takes settings in one piece
+        words = [*(words[at] for at in places), *(each for at, each in enumerate(words) if at not in places)]
+    sys.argv[1:] = words
 
 
 @contextlib.contextmanager

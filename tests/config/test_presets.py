@@ -49,7 +49,7 @@ def test_a_preset_is_chosen_alike_from_python_and_by_the_command(tmp_path: Path)
 
 
 def test_each_job_of_a_sweep_has_its_own_preset_and_a_line_says_so(tmp_path: Path) -> None:
-    words = ["-m", "agent=q_learning", "env.slip=0,0.1", "seed=1", f"hydra.sweep.dir={tmp_path}/s"]
+    words = ["agent=q_learning", "-m", "env.slip=0,0.1", "seed=1", f"hydra.sweep.dir={tmp_path}/s"]
     done = script("train.py", *words, *NO_FILES[:-1], cwd=tmp_path)
     files = sorted((tmp_path / "s").glob("*/manifest.json"))
     manifests = [json.loads(file.read_text()) for file in files]
