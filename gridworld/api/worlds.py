@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -74,6 +75,8 @@ def evaluate(
         model_or_table = model_or_table.greedy if deterministic else model_or_table.sampled
     is_model = hasattr(model_or_table, "observation_space")
     place = model_or_table.get_env() if env is None and hasattr(model_or_table, "get_env") else env
+    if place is None and isinstance(model_or_table, str | PathLike):
+        raise InputError(f"evaluate: {model_or_table} is a path; open the run with open_run(path) first")
     if place is None:
         raise InputError("env: is required; give an environment, a compiled world or the name of a world")
     if isinstance(place, str):

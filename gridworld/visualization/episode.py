@@ -107,12 +107,16 @@ class RealEnv:
 
     def __init__(self, env: GymnasiumConfig, mdp: Mdp) -> None:
         self._id, self._mdp = env.id, mdp
-        self._env = make_env(env.id, dict(env.kwargs), render_mode="rgb_array")
-        self.has_table = has_table(self._env.unwrapped)
+        with closing(make_env(env.id, dict(env.kwargs))) as plain:
+            self.has_table = has_table(plain.unwrapped)
+            draws = "rgb_array" in (plain.metadata.get("render_modes") or ())
         if not self.has_table and (mdp.is_stochastic or len(mdp.start_states) > 1):
             raise InputError(
                 f"env.id={env.id}: its steps are random, so it cannot be led through the states of an episode"
             )
+        if not draws:
+            raise InputError(f"env.id={env.id}: draws no pictures; rgb_array is not among its render_modes")
+        self._env = make_env(env.id, dict(env.kwargs), render_mode="rgb_array")
 
     def reset(self, state: int) -> None:
         """Start an episode in a start state."""

@@ -350,3 +350,10 @@ def test_large_frames_are_made_smaller():
 def test_what_cannot_be_rendered_is_one_sentence(env_id, words):
     with pytest.raises(InputError, match=f"^env.id={env_id}: {words}"):
         frames_of(env_id, [36, 24, 25], FROZEN_LAKE if env_id == "Blackjack-v1" else CLIFF_WALKING)
+
+
+def test_an_environment_that_draws_nothing_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = gym.envs.registration.EnvSpec("Plain-v0", entry_point="helpers.faulty_envs:Deaf")
+    monkeypatch.setitem(gym.registry, "Plain-v0", spec)
+    with pytest.raises(InputError, match=r"^env.id=Plain-v0: draws no pictures; rgb_array is not among"):
+        frames_of("Plain-v0", [36], CLIFF_WALKING)
