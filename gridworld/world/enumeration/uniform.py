@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Iterable
 from fractions import Fraction
+from functools import lru_cache
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from gridworld.world.mdp import IntArray
 
 if TYPE_CHECKING:
     from gridworld.world.enumeration.branching import Branching
@@ -26,6 +30,20 @@ def weights_of(probabilities: Iterable[Fraction]) -> Weights:
     found = list(probabilities)
     common = math.lcm(*(each.denominator for each in found))
     return tuple(each.numerator * (common // each.denominator) for each in found)
+
+
+@lru_cache(256)
+def _split(
+    low: Fraction, high: Fraction, scale: Fraction, offset: Fraction, thresholds: tuple[float, ...]
+) -> tuple[list[Fraction], Weights, IntArray]:
+    """Edges of the parts of [low, high) in which `scale` * u + `offset` is on one side of each threshold.
+
+    With the weights of the parts, and the number of edges that are below each threshold.
+    """
+    cuts = [(Fraction(each) - offset) / scale for each in thresholds]
+    edges = [low, *sorted({cut for cut in cuts if low < cut < high}), high]
+    weights = weights_of(end - start for start, end in itertools.pairwise(edges))
+    return edges, weights, np.array([bisect_left(edges, cut) for cut in cuts], dtype=np.int64)
 
 
 class Uniform:
@@ -72,18 +90,18 @@ class Uniform:
                 f"a random number meets a {other.dtype}, to which it is rounded", "; use float64", self._drawn
             )
 
-    def _among(self, cuts: Sequence[Fraction]) -> Fraction:
-        """Split the interval at the cuts that are in it; returns where the part begins that u is in."""
+    def _among(self, thresholds: Iterable[float]) -> tuple[int, IntArray]:
+        """Split the interval at thresholds; the number of the part that u is in, and see `_split`."""
         if self._run != self._branching.run:
             self._branching.refuse("a random number is kept beyond its step", drawn=self._drawn)
-        low, high = self._interval
-        edges = [low, *sorted({cut for cut in cuts if low < cut < high}), high]
-        if len(edges) > 2:
-            if len(edges) > MOST_OUTCOMES:
+        edges, weights, below = _split(*self._interval, self._scale, self._offset, tuple(thresholds))
+        part = 0
+        if len(weights) > 1:
+            if len(weights) >= MOST_OUTCOMES:
                 self._refuse()
-            part = self._branching.decide(weights_of(end - start for start, end in itertools.pairwise(edges)))
+            part = self._branching.decide(weights)
             self._interval[:] = edges[part : part + 2]
-        return self._interval[0]
+        return part, below
 
     def _is_below(self, threshold: Any) -> Any:
         """Whether it is less than a threshold, or than each of an array."""
@@ -94,12 +112,9 @@ class Uniform:
         is_number = not isinstance(threshold, list | tuple) and given.dtype.kind in "biuf"
         if not is_number or self._scale == 0 or np.isnan(given).any():
             self._refuse()
-        finite = np.where(np.isfinite(given), given, 0).ravel().tolist()
-        cuts = [(Fraction(each) - self._offset) / self._scale for each in finite]
-        infinite = np.isinf(given).ravel()
-        start = self._among([cut for cut, is_not in zip(cuts, infinite, strict=True) if not is_not])
-        found = np.array([(cut > start) == (self._scale > 0) for cut in cuts], dtype=np.bool_)
-        found = np.where(infinite, given.ravel() > 0, found).reshape(given.shape)
+        found, is_finite = np.array(given > 0), np.isfinite(given)  # of what is infinite, the sign says it
+        part, below = self._among(given[is_finite].tolist())
+        found[is_finite] = (below > part) == (self._scale > 0)
         if given.ndim:
             return found
         return np.bool_(found) if self._is_numpys or isinstance(threshold, _NUMPYS) else bool(found)
@@ -117,8 +132,8 @@ class Uniform:
         whole = range(math.floor(min(edges)), math.ceil(max(edges)))
         if self._scale == 0 or len(whole) > MOST_OUTCOMES:
             self._refuse()
-        start = self._among([(each - self._offset) / self._scale for each in whole])
-        middle = (start + self._interval[1]) / 2
+        self._among(whole)
+        middle = sum(self._interval) / 2
         return math.floor(self._scale * middle + self._offset)
 
     def __int__(self) -> int:

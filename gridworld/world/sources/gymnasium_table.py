@@ -7,7 +7,8 @@ Environments of Gymnasium's `toy_text` family have a table `P` and a start distr
 
 Ending belongs to the outcome there; `gridworld.world.outcomes` makes it a state. An environment whose steps
 are not those of its table is refused: the real one is walked beside the table (`table_walk`), each step must
-be an outcome of its row, and as frequent as the row says, as far as that can be told.
+be an outcome of its row, and as likely as the row says: exactly where all draws can be tried, and else as
+far as frequencies tell.
 """
 
 from __future__ import annotations

@@ -1,14 +1,19 @@
 """A real environment beside its transition table: which outcomes occur, and how often.
 
-It is walked along several policies; where its state can be set, every row of the table is stepped, and those
-that look wrong again. The counts are judged by Bayes factors against the table: with a true table one that is
-ever above 1/α has at most probability α, whatever is stepped next and whenever one looks.
+It is walked along several policies; where its state can be set, every row of the table is stepped, and every
+outcome of what a row or a reset draws from `np_random` is tried (`enumeration.branching`), so that its
+probability is known exactly. Counts, which what it remembers or draws elsewhere would show in, are judged by
+Bayes factors against the table: with a true table one that is ever above 1/α has at most probability α,
+whatever is stepped next and whenever one looks.
 
 Reference: J. Ville, Étude critique de la notion de collectif, 1939.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from fractions import Fraction
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
 from gridworld.base.errors import InputError
+from gridworld.world.enumeration.branching import Branching
 from gridworld.world.mdp import FloatArray, IntArray, Mdp, backup
 from gridworld.world.outcomes import Outcomes
 
@@ -32,8 +38,8 @@ _SWEEPS = 100  # at most, of value iteration, for the policies of the walk
 _WORK = 2 * 10**7  # outcomes that it takes in a policy, and in all that lead to what is new
 _WALK = 6_000  # steps along policies where the state can be set besides
 _LONG_WALK = 24_000  # more of them where it cannot
-_ROWS = 24_000  # steps over all rows
-_ROUNDS, _SUSPECTS, _AGAIN = 4, 8, 500  # how often how many rows that look wrong are stepped how many times
+_ROWS = 24_000  # steps over all rows, and outcomes that are tried
+_EXACT = 2e-9  # how far a probability may be off, since those of a row may sum to 1 +- 1e-9
 _MOST_STEPS = 200  # of an episode, where there is no limit
 _RESETS = 1_500  # at least
 _SEEDED = 11  # so often with a seed
@@ -49,6 +55,7 @@ def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> str:
     while walker.episodes < _RESETS:
         walker.reset()
     if walker.is_settable():
+        walker.try_outcomes()
         walker.along_rows()
     else:
         walker.along_policies(_LONG_WALK)
@@ -74,6 +81,9 @@ class _Walker:
         self._open = np.flatnonzero(np.repeat(mdp.acting[: len(table.start)], mdp.num_actions))
         self._met: list[tuple[int, int, float, bool]] = []  # row, next state, reward, terminated
         self._state = self._elapsed = 0
+        self._is_exact = np.zeros(
+            1 + len(self._chance), dtype=np.bool_
+        )  # of each row, and last of the starts
 
     def reset(self) -> None:
         seed = None if self.episodes % _SEEDED else SEED + self.episodes  # never one twice
@@ -181,18 +191,63 @@ class _Walker:
         possible = self.table.probability[state, action] > 0
         return set(zip(*(each[state, action][possible].tolist() for each in tables), strict=True))
 
-    def along_rows(self) -> None:
-        """Step every row, or as many as there is time for, and those that look most wrong again."""
-        rows = self._rng.permutation(self._open)[:_ROWS]
-        self._step_rows(self._rng.permutation(np.tile(rows, _ROWS // len(rows))))
-        uncertain = rows[self._chance[rows].max(axis=1) < 1]
-        for _ in range(_ROUNDS):
-            wrong = np.argsort(-evidence(self._counts[uncertain], self._chance[uncertain]), kind="stable")
-            self._step_rows(np.repeat(uncertain[wrong[:_SUSPECTS]], _AGAIN))
+    def try_outcomes(self) -> None:
+        """Try all that resets and rows draw from `np_random`, as long as nothing is drawn elsewhere."""
+        own, tables = self.real.unwrapped, (self.table.next_state, self.table.reward, self.table.terminated)
+        generator, branching = own.np_random, Branching(self.mdp.name)
 
-    def _step_rows(self, rows: IntArray) -> None:
+        def step(state: int, action: int) -> tuple[int, float, bool]:
+            self._set(state)
+            observation, reward, terminated, *_ = self.real.step(action)
+            return self._shown(observation), float(reward), bool(terminated)
+
+        own.np_random = branching  # type: ignore[assignment]
+        try:
+            starts = enumerate(self.table.start.tolist())
+            is_known = self._try(branching, -1, lambda: self._shown(self.real.reset()[0]), starts)
+            for row in self._rng.permutation(self._open).tolist():
+                if not is_known or branching.run > _ROWS:
+                    break
+                pair = divmod(row, self.mdp.num_actions)
+                outcomes = zip(*(each[pair].tolist() for each in tables), strict=True)
+                chances = zip(outcomes, self.table.probability[pair].tolist(), strict=True)
+                is_known = self._try(branching, row, partial(step, *pair), chances)
+        finally:
+            own.np_random = generator
+
+    def _try(
+        self, branching: Branching, row: int, draw: Callable[[], Any], chances: Iterable[tuple[Any, float]]
+    ) -> bool:
+        """Compare what is drawn, and how likely it is, with a row, -1 for the starts; whether it could be."""
+        expected, found, has_drawn = dict[Any, Fraction](), dict[Any, Fraction](), False
+        for outcome, chance in chances:
+            expected[outcome] = expected.get(outcome, Fraction(0)) + Fraction(chance)
+        try:
+            for share, outcome in branching.outcomes(draw):
+                found[outcome] = found.get(outcome, Fraction(0)) + Fraction(*share)
+                has_drawn |= branching.has_drawn
+        except InputError:  # another generator, or too much to be tried
+            return False
+        off = {each: found.get(each, Fraction(0)) - expected.get(each, 0) for each in expected | found}
+        worst = max(off, key=lambda each: float(abs(off[each])))
+        self._is_exact[row] = abs(off[worst]) <= _EXACT
+        if has_drawn and not self._is_exact[row]:
+            place = f"the start in state {worst}"
+            if row >= 0:
+                following, reward, _ = worst
+                place = f"{self._name(row)}, to state {following} with reward {reward:g},"
+            raise InputError(
+                f"{self.mdp.name}: does not follow its own table: {place} occurs with a probability of "
+                f"{float(found.get(worst, 0)):.6g}, in the table it is {float(expected.get(worst, 0)):.6g}, "
+                "so it cannot be solved exactly"
+            )
+        return bool(self._is_exact[row])
+
+    def along_rows(self) -> None:
+        """Step every row, or as many as there is time for."""
+        rows = self._rng.permutation(self._open)[:_ROWS]
         over = True
-        for row in rows.tolist():
+        for row in self._rng.permutation(np.tile(rows, _ROWS // len(rows))).tolist():
             if over:
                 self.reset()
             state, action = divmod(row, self.mdp.num_actions)
@@ -267,13 +322,15 @@ class _Walker:
         """What the counts say."""
         visits = self._counts.sum(axis=1)
         stepped = self._open[visits[self._open] > 0]
-        off = _resolved(visits[stepped], self._chance[stepped])
+        sampled = stepped[~self._is_exact[stepped]]
+        off = _resolved(visits[sampled], self._chance[sampled]).max(initial=0)
         rows = f"{len(stepped):,} of {len(self._open):,}" if len(stepped) < len(self._open) else "all"
-        starts = _resolved(self._started.sum(keepdims=True), self.table.start[None])
+        (starts,) = _resolved(self._started.sum(keepdims=True), self.table.start[None])
+        parts = ("probabilities", not sampled.size, off), ("starts", self._is_exact[-1], starts)
         precise = [
-            f"{what} to {100 * worst:.2g} %"
-            for what, worst in (("probabilities", off.max(initial=0)), ("starts", starts[0]))
-            if worst < _VAGUE
+            f"exact {what}" if is_exact else f"{what} to {100 * worst:.2g} %"
+            for what, is_exact, worst in parts
+            if is_exact or worst < _VAGUE
         ]
         return (
             f"table P, checked by {visits.sum():,} steps in {self.episodes:,} episodes: "

@@ -42,6 +42,28 @@ class OneRow(Lake):
         return [0.6, 0.2, 0.2] if (self.s, action) == (27, 1) else super().chances(action)
 
 
+class HardlyOneRow(Lake):
+    """By less than any number of steps here shows."""
+
+    def chances(self, action: int) -> list[float]:
+        third = 1 / 3
+        odd = (self.s, action) == (27, 1)
+        return [third + 2e-3, third - 1e-3, third - 1e-3] if odd else super().chances(action)
+
+
+class OwnDraws(Lake):
+    """True, but it draws from a generator that cannot be replaced."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+        self.draws = np.random.default_rng(seed)
+        return super().reset(seed=seed)
+
+    def step(self, action: int) -> tuple[Any, ...]:
+        row = self.P[self.s][action]
+        _, self.s, reward, terminated = row[int(self.draws.random() * len(row))]
+        return int(self.s), reward, terminated, False, {}
+
+
 class Sticky(Lake):
     """What the ice did last, it is likely to do again."""
 
@@ -153,9 +175,13 @@ class Remembered(Chain):
 
 LIES = {
     "all rows": (AllRows, "all rows like P"),
-    "one row": (OneRow, r"P\[27\]\[1\], outcome 0, occurred"),
+    "one row": (OneRow, r"P\[27\]\[1\], to state 26 .* probability of 0.6, in the table it is 0.333333"),
+    "hardly one row": (
+        HardlyOneRow,
+        r"P\[27\]\[1\], to state 26 .* of 0.335333, in the table it is 0.3333",
+    ),
     "sticky": (Sticky, "outcome [0-2], occurred"),
-    "starts": (FarStarts, "(the start in state|of 8 parts of the starts, part) [0-9]*, occurred"),
+    "starts": (FarStarts, r"the start in state \d+ occurs with a probability of 0.000666667, in the table"),
     "seeded": (Seeded, "led to state"),
     "rare slips": (
         liar(Lake, lambda env, a: (a + 1) % 4 if env.np_random.random() < 0.01 else a),
@@ -186,9 +212,11 @@ def test_what_is_not_the_table_is_found(kind: str) -> None:
         compile_table(made(), 150)
 
 
-@pytest.mark.parametrize("kind", [Lake, Shadowed, Chain, Remembered])
+@pytest.mark.parametrize("kind", [Lake, OwnDraws, Shadowed, Chain, Remembered])
 def test_a_true_table_is_not_refused_however_it_is_stepped(kind: type[gym.Env[Any, Any]]) -> None:
-    assert compile_table(kind()).num_actions in (2, 4)
+    mdp = compile_table(kind())
+    assert mdp.num_actions in (2, 4)
+    assert ("exact probabilities" in mdp.truth) == (kind is Lake)
 
 
 @pytest.mark.parametrize(
@@ -206,9 +234,7 @@ def test_gymnasium_s_own_are_far_from_being_refused(
     monkeypatch.setattr(table_walk, "FALSE_ALARM", 0.01)
     told = compile_gymnasium(env_id, kwargs).truth
     assert told.startswith("table P, checked by ")
-    assert "support of all rows, " in told
-    assert "starts to" in told
-    assert ("probabilities to" in told) == (env_id != "Taxi-v4")  # which has too many rows for that
+    assert told.endswith("support of all rows, exact probabilities, exact starts")
 
 
 class Swamp(Chain):
