@@ -226,7 +226,7 @@ class _Walker:
             for share, outcome in branching.outcomes(draw):
                 found[outcome] = found.get(outcome, Fraction(0)) + Fraction(*share)
                 has_drawn |= branching.has_drawn
-        except InputError:  # another generator, or too much to be tried
+        except Exception:  # another use of random numbers than can be tried
             return False
         off = {each: found.get(each, Fraction(0)) - expected.get(each, 0) for each in expected | found}
         worst = max(off, key=lambda each: float(abs(off[each])))

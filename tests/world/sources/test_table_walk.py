@@ -64,6 +64,15 @@ class OwnDraws(Lake):
         return int(self.s), reward, terminated, False, {}
 
 
+class Rounded(Lake):
+    """True, but a number that stands for all of an interval cannot be used like this."""
+
+    def step(self, action: int) -> tuple[Any, ...]:
+        row = self.P[self.s][action]
+        _, self.s, reward, terminated = row["012".index(str(self.np_random.random() * len(row))[0])]
+        return int(self.s), reward, terminated, False, {}
+
+
 class Sticky(Lake):
     """What the ice did last, it is likely to do again."""
 
@@ -212,7 +221,7 @@ def test_what_is_not_the_table_is_found(kind: str) -> None:
         compile_table(made(), 150)
 
 
-@pytest.mark.parametrize("kind", [Lake, OwnDraws, Shadowed, Chain, Remembered])
+@pytest.mark.parametrize("kind", [Lake, OwnDraws, Rounded, Shadowed, Chain, Remembered])
 def test_a_true_table_is_not_refused_however_it_is_stepped(kind: type[gym.Env[Any, Any]]) -> None:
     mdp = compile_table(kind())
     assert mdp.num_actions in (2, 4)
