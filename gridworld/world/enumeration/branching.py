@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -27,7 +27,7 @@ from gridworld.world.enumeration import uniform
 from gridworld.world.enumeration.uniform import MOST_OUTCOMES, Uniform, Weights, weights_of
 from gridworld.world.mdp import IntArray
 
-Result = TypeVar("Result")
+Result = TypeVar("Result", bound=Hashable)
 Share = tuple[int, int]  # of all outcomes: numerator and denominator, not in lowest terms
 
 _MOST_DRAWS = 500  # of one step; a loop that rejects what it draws may have any number
@@ -64,12 +64,15 @@ class Branching:
         self._is_running = False
         self._num_results = 0
 
-    def outcomes(self, step: Callable[[], Result]) -> Iterator[tuple[Share, Result]]:
-        """Run a step once for each sequence of draws: the share and the result of each."""
+    def outcomes(self, step: Callable[[], Result]) -> dict[Result, Fraction]:
+        """Run a step once for each sequence of draws: its different results, each with its probability."""
         self._decisions, self._taken = [], []
+        shares: dict[Result, dict[int, int]] = {}  # numerators by denominators, which is fast
         for _ in range(MOST_BRANCHES):
             result = self._ran(step)
-            yield self._share(), result
+            numerator, denominator = self._share()
+            of_result = shares.setdefault(result, {})
+            of_result[denominator] = of_result.get(denominator, 0) + numerator
             self._num_results += 1
             if self._num_results <= _REPEATED or self._num_results % _REPEATED == 0:
                 # Once, twice or three times, so that no memory has the same rhythm.
@@ -80,7 +83,10 @@ class Branching:
                 self._taken.pop()
                 self._decisions.pop()
             if not self._taken:
-                return
+                return {
+                    result: sum((Fraction(number, of) for of, number in each.items()), Fraction(0))
+                    for result, each in shares.items()
+                }
             self._taken[-1] += 1
         raise InputError(f"{self._where}: one step has more than {MOST_BRANCHES:,} random outcomes")
 

@@ -17,7 +17,6 @@ import pickle
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import EnumType
-from fractions import Fraction
 from typing import Any
 
 import gymnasium as gym
@@ -230,21 +229,19 @@ class StateSearch:
 
     def _merged(self, run: Callable[[], tuple[int, bytes, float, bool, bool]]) -> list[Step]:
         """Its different results, each with its probability."""
-        sums: dict[tuple[int, bytes, float, bool, bool], dict[int, int]] = {}  # numerators by denominators
-        for (numerator, denominator), result in self._branching.outcomes(run):
-            shares = sums.setdefault(result, {})
-            shares[denominator] = shares.get(denominator, 0) + numerator
+
+        def watched() -> tuple[int, bytes, float, bool, bool]:
+            result = run()
             self._num_runs += 1
             self.is_random |= self._branching.has_drawn
             if self._num_runs <= _WATCHED or not self._num_runs % _WATCHED_LATER:
                 self._check_outside()
+            return result
+
+        found = self._branching.outcomes(watched)
         if self._num_runs > _MOST_RUNS:
             raise self.refusal(f"its random outcomes are more than {_MOST_RUNS:,}, too many to try them all")
-        totals = {
-            result: sum((Fraction(number, of) for of, number in shares.items()), Fraction(0))
-            for result, shares in sums.items()
-        }
-        return [Step(probability, *result) for result, probability in totals.items()]
+        return [Step(probability, *result) for result, probability in found.items()]
 
     def _state_after(self, observation: Any, depth: int, is_over: bool = False) -> tuple[int, bytes]:
         """The number of the state that the environment is in, and a digest of the observation."""

@@ -219,19 +219,17 @@ class _Walker:
         self, branching: Branching, row: int, draw: Callable[[], Any], chances: Iterable[tuple[Any, float]]
     ) -> bool:
         """Compare what is drawn, and how likely it is, with a row, -1 for the starts; whether it could be."""
-        expected, found, has_drawn = dict[Any, Fraction](), dict[Any, Fraction](), False
+        expected = dict[Any, Fraction]()
         for outcome, chance in chances:
             expected[outcome] = expected.get(outcome, Fraction(0)) + Fraction(chance)
         try:
-            for share, outcome in branching.outcomes(draw):
-                found[outcome] = found.get(outcome, Fraction(0)) + Fraction(*share)
-                has_drawn |= branching.has_drawn
+            found = branching.outcomes(draw)
         except Exception:  # another use of random numbers than can be tried
             return False
         off = {each: found.get(each, Fraction(0)) - expected.get(each, 0) for each in expected | found}
         worst = max(off, key=lambda each: float(abs(off[each])))
         self._is_exact[row] = abs(off[worst]) <= _EXACT
-        if has_drawn and not self._is_exact[row]:
+        if branching.has_drawn and not self._is_exact[row]:
             place = f"the start in state {worst}"
             if row >= 0:
                 following, reward, _ = worst
