@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 from gridworld.base.errors import InputError
@@ -27,6 +28,8 @@ class Bounds:
 
     def check(self, key: str, number: float, written: object = None) -> None:
         """Refuse a number outside; `written` is how the setting has it."""
+        if not isinstance(number, Real):
+            raise InputError(f"{key}={str(number)[:50]}: must be a number, {self}")
         is_high_enough = self.low < number if self.above else self.low <= number
         is_large_enough = number == 0 or abs(number) >= self.least
         if not (is_high_enough and is_large_enough and number <= self.high and abs(number) < math.inf):

@@ -255,12 +255,13 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
     how = f"{over:,} terminated, {cut:,} truncated; step limit {limit}"
     yield "episodes", f"{len(lengths):,} of {lengths.min():,} to {lengths.max():,} steps, {how}"
     rewards = f"from {steps.reward.min() + 0.0:.4g} to {steps.reward.max() + 0.0:.4g}"
-    is_usual = np.mean(steps.reward == seen.usual) >= 0.5 or seen.reach is not None
+    is_usual = np.mean(steps.reward == seen.usual) >= 0.5
     yield "rewards", f"{rewards}, mostly {seen.usual + 0.0:.4g}" if is_usual else rewards
     at_random = steps.last[steps.at_random[steps.last]]
     if seen.reach is not None:
         soonest = "" if seen.reach[1] is None else f", which is {seen.reach[1]:,} steps away"
-        yield "random policy", f"comes to the reward in {seen.reach[0]:.3%} of episodes (exact){soonest}"
+        what = "the reward" if is_usual else f"a reward above {seen.usual + 0.0:.4g}"
+        yield "random policy", f"comes to {what} in {seen.reach[0]:.3%} of episodes (exact){soonest}"
     elif is_usual and (seen.paid.any() or seen.usual <= 0) and len(at_random):
         hits = len(np.unique(steps.episode[steps.at_random & seen.paid]))
         low, high = wilson_interval(hits, len(at_random))

@@ -128,6 +128,7 @@ def check(
             raise InputError(f"processes={processes}: needs a function that can be imported; use 1") from None
     started = time.monotonic()
     known = [probe.name for probe in PROBES]
+    probes = [probes] if isinstance(probes, str) else probes
     for name in probes:
         if name not in known:
             raise InputError(f"--probe {name}: no such probe; choose from {', '.join(known)}")

@@ -62,11 +62,7 @@ class Seen:
     @cached_property
     def usual(self) -> float:
         """The most frequent reward."""
-        rewards = self.steps.reward
-        if self.mdp is not None:
-            acting = self.mdp.acting
-            rewards = self.mdp.reward[acting][self.mdp.probability[acting] > 0]
-        values, counts = np.unique(rewards, return_counts=True)
+        values, counts = np.unique(self.steps.reward, return_counts=True)
         return float(values[counts.argmax()]) if len(values) else 0.0
 
     @cached_property

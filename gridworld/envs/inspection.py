@@ -112,7 +112,8 @@ def _task(env: Any) -> Task:
 def _no_world(env: Any) -> InputError:
     return InputError(
         f"env: {type(env).__name__} contains neither a GridWorld nor a transition table; must be a "
-        "GridWorld environment, a Gymnasium one with a table P, a compiled world, or a world's name"
+        "GridWorld environment, a Gymnasium one with a table P, a compiled world, or a world's name; another "
+        "environment of Gymnasium is enumerated if its id is given, e.g. compile_env('my_module:My-v0')"
     )
 
 
@@ -138,10 +139,11 @@ def _single(env: gym.Env[Any, Any]) -> Task:
     else:
         raise _no_world(real)
     wrapped = Wrapped("env", env, mdp)
+    is_number = isinstance(env.observation_space, gym.spaces.Discrete)  # maybe of an earlier state
     return Task(
         mdp=wrapped.mdp,
         own_limit=limit,
-        is_transformed=bool(wrapped.transforms),
+        is_transformed=bool(wrapped.transforms or (wrapped.memory and is_number)),
         seen=functools.cache(lambda: _seen(env, wrapped, mdp)),
         masks=lambda: wrapped.action_masks,
     )

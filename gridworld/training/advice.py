@@ -49,7 +49,9 @@ def _commands(saved: SavedRun, place: str) -> Iterator[list[str]]:
     """(why, command) of what may help."""
     run, config = saved.run, saved.config
     words = [word for word in saved.overrides if _key(word) not in _REPLACED]
-    if config.recipe is None and (env := _world_with_recipe(config)) is not None:
+    if saved.omission:  # then words of its command line are missing
+        pass
+    elif config.recipe is None and (env := _world_with_recipe(config)) is not None:
         own = [word for word in words if _key(word).partition(".")[0] not in ("env", "experiment", "agent")]
         yield ["its recipe:", _train([f"agent={config.agent.name}", f"env={env}", *own])]
     elif config.recipe is None and config.preset in (AUTO, "none") and "experiment" not in map(_key, words):
@@ -77,8 +79,9 @@ def _world_with_recipe(config: TrainConfig) -> str | None:
 
 
 def _still_falls(run: RunReader) -> bool:
-    regret = read_columns(run, ("step", "regret", "certified"))["regret"]
-    if len(regret) < _FEWEST or not np.isfinite(regret).all():
+    curve = read_columns(run, ("step", "regret", "certified"))
+    regret = curve["regret"]
+    if len(regret) < _FEWEST or not np.isfinite(regret).all() or (curve["certified"] == 1).any():
         return False
     _, _, before, last = (float(part.mean()) for part in np.array_split(regret, 4))
     return last < _FALLS * before

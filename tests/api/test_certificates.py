@@ -711,6 +711,14 @@ def test_a_table_may_be_by_what_the_environment_shows() -> None:
     assert gridworld.evaluate(BEST, flat_lake()).certified
 
 
+def test_a_table_behind_a_delay_is_refused() -> None:
+    """It would act on the number of an earlier state; with several numbers at once a table is by states."""
+    assert gridworld.evaluate(BEST, lake()).certified
+    with pytest.raises(InputError, match="DelayObservation makes observations that depend on more than"):
+        gridworld.evaluate(BEST, wrappers.DelayObservation(lake(), 1))
+    assert gridworld.evaluate(BEST, wrappers.FrameStackObservation(lake(), 2)).certified
+
+
 def test_observations_are_what_a_batch_makes_of_them() -> None:
     def halves(dtype: Any) -> Any:
         space = spaces.Box(0, 1, (16,), dtype)

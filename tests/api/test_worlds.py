@@ -301,6 +301,7 @@ def refused(*given: Any, **named: Any) -> str:
         ((), {"env": "classic"}, "give either a model or table"),
         (("abc", "classic"), {}, "str is neither a model, an opened run nor a table of numbers"),
         (([1] * 30,), {}, "env: is required"),
+        (([1] * 30, "classic"), {"gamma": "x"}, "gamma=x: must be a number"),
         (("runs/a",), {}, r"runs/a is a path; open the run with open_run"),
         (([1] * 30, "nope"), {}, "env=nope: no such world"),
         (([1] * 30, 3), {}, "env: int contains neither a GridWorld"),

@@ -90,6 +90,11 @@ class Branching:
             self._taken[-1] += 1
         raise InputError(f"{self._where}: one step has more than {MOST_BRANCHES:,} random outcomes")
 
+    def first(self, step: Callable[[], Result]) -> Result:
+        """The result of a step in which every draw has its first outcome."""
+        self._decisions, self._taken = [], []
+        return self._ran(step)
+
     def _ran(self, step: Callable[[], Result]) -> Result:
         """The result of a step with the decisions that are taken, and first outcomes after them."""
         self._place, self.run, self._is_running = 0, self.run + 1, True

@@ -15,7 +15,7 @@ import marshal
 import pickle
 import random
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import Any
 
@@ -164,6 +164,21 @@ class Snapshots:
     def keys(self, without: Collection[str] = ()) -> dict[str, bytes]:
         """A digest of each attribute."""
         return {name: self._digest(value) for name, value in self._attributes(without)}
+
+    def values(self, without: Collection[str] = ()) -> Iterator[tuple[str, Any]]:
+        """Each attribute that is not kept as it is, with something hashable that tells its values apart."""
+        for name, value in vars(self._env).items():
+            kind = type(value)
+            if name in without or id(value) in self._kept:
+                continue
+            if kind in PLAIN:
+                yield name, (kind, value)
+            elif kind in _SCALARS:
+                yield name, (kind, value.tobytes())
+            elif (kind is list or kind is tuple) and PLAIN.issuperset(map(type, value)):
+                yield name, marshal.dumps(value, 2)
+            else:
+                yield name, self._digest(value)
 
     def random_states(self) -> list[tuple[Any, Any]]:
         """The generators anywhere in the state, with their states."""

@@ -17,7 +17,7 @@ import pickle
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import EnumType
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium as gym
 import numpy as np
@@ -91,6 +91,8 @@ class StateSearch:
         self._by_copy: dict[bytes, State] = {}  # by a digest of a copy, of which a state may have several
         self._num_bytes = self._num_runs = 0
         self._outside, self._before = list[Reach](), list[bytes]()
+        self._values = set[tuple[str, Any]]()  # of all attributes, in all states and ends so far
+        self._not_reset: list[bytes] = []  # copies with a value among these that no reset was tried from
 
     def refusal(self, reason: str) -> InputError:
         """An error that says why there is no table of it."""
@@ -100,9 +102,9 @@ class StateSearch:
         """Find the starts, with the generator that branches wherever the environment holds its own."""
         own = self.env.np_random  # it is made when it is first asked for
         self._snapshots.replace(own, self._branching)
-        first = self._snapshots.take()  # before the first reset, which may set what others keep
+        self._first = self._snapshots.take()  # before the first reset, which may set what others keep
         try:
-            self.starts = self._resets(first)
+            self.starts = self._resets(self._first)
         except InputError:
             self._reached()  # which may name the reason
             raise
@@ -124,7 +126,7 @@ class StateSearch:
         waiting = list({each.number: each for each in waiting}.values())
         for state in waiting:
             state.is_open = True
-        self._check_resets(waiting[0])
+        self._check_resets(waiting[0].copy)
         beyond: int | None = None  # where in `waiting` the limit is, with `size` states before it
         for place, state in enumerate(waiting):  # which grows
             if beyond is None and state.depth >= (limit or _DEEPEST):
@@ -142,13 +144,14 @@ class StateSearch:
                     late.steps = ()
                 del self.states[size:]
                 break
+            self._check_first_resets()
             for step in itertools.chain.from_iterable(state.steps):
                 following = self.states[step.following]  # of an end, any
                 if not (step.terminated or step.truncated or following.is_open):
                     following.is_open = True
                     waiting.append(following)
         self._check_outside()
-        self._check_resets(next(each for each in reversed(self.states) if each.copy))
+        self._check_resets(next(each.copy for each in reversed(self.states) if each.copy))
 
     def _reached(self) -> list[Reach]:
         where = f"env.id={self.name}"
@@ -164,36 +167,57 @@ class StateSearch:
 
     def _resets(self, copy: bytes) -> list[Step]:
         """What a reset leads to from a copy of a state."""
-
-        def reset() -> tuple[int, bytes, float, bool, bool]:
-            self._snapshots.put_back(copy)
-            try:
-                observation, _ = self.env.reset()
-            except Exception as error:  # whatever it raises
-                raise self.refusal(f"a reset fails: {error}") from error
-            if vars(self.env).get("_np_random") is not self._branching:
-                raise self.refusal("reset() makes another np_random; leave that to super().reset(seed=seed)")
-            return *self._state_after(observation, 0), 0.0, False, False
-
         with self._no_other_draws("reset"):
-            return self._merged(reset)
+            return self._merged(functools.partial(self._reset, copy))
 
-    def _check_resets(self, state: State) -> None:
-        """A reset must lead to the same from every state."""
+    def _reset(self, copy: bytes) -> tuple[int, bytes, float, bool, bool]:
+        self._snapshots.put_back(copy)
+        try:
+            observation, _ = self.env.reset()
+        except Exception as error:  # whatever it raises
+            raise self.refusal(f"a reset fails: {error}") from error
+        if vars(self.env).get("_np_random") is not self._branching:
+            raise self.refusal("reset() makes another np_random; leave that to super().reset(seed=seed)")
+        return *self._state_after(observation, 0), 0.0, False, False
+
+    def _has_new_values(self) -> bool:
+        """Whether an attribute has a value that it had in no state or end before."""
+        size = len(self._values)
+        self._values.update(self._snapshots.values(self.ignore))
+        return len(self._values) > size
+
+    def _check_first_resets(self) -> None:
+        """A reset must lead to the same after each value that an attribute has, in ends too, by one draw."""
+        while self._not_reset:
+            copy = self._not_reset.pop()
+            if self._branching.first(functools.partial(self._reset, copy))[:2] != self.starts[0][1:3]:
+                self._refuse_reset(copy)
+
+    def _check_resets(self, copy: bytes) -> None:
+        """A reset must lead to the same, whatever it draws."""
         size = len(self.states)
-        found = self._resets(state.copy)
-        if len(self.states) == size and sorted(found) == sorted(self.starts):
-            return
-        values: list[dict[str, bytes]] = []
-        one, other = ({each.following for each in steps} for steps in (self.starts, found))
-        for each in (min(one - other or one), min(other - one or other)):
-            self._snapshots.put_back(self.states[each].copy)
-            values.append(self._snapshots.keys(self.ignore))
-        changed = _listed(name for name, each in values[1].items() if each != values[0].get(name))
+        if sorted(self._resets(copy)) != sorted(self.starts) or len(self.states) > size:
+            self._refuse_reset(copy)
+
+    def _refuse_reset(self, copy: bytes) -> NoReturn:
+        usual, found = self._values_after_resets(self._first), self._values_after_resets(copy)
+        changed = _listed(name for name in usual | found if usual.get(name) != found.get(name))
         raise self.refusal(
             f"a reset does not always lead to the same state (in {changed}), so its states cannot be "
             "enumerated from one start; set all of it in reset(), or list irrelevant attributes in env.ignore"
         )
+
+    def _values_after_resets(self, copy: bytes) -> dict[str, set[bytes]]:
+        values: dict[str, set[bytes]] = {}
+
+        def reset() -> tuple[int, bytes, float, bool, bool]:
+            result = self._reset(copy)
+            for name, value in self._snapshots.keys(self.ignore).items():
+                values.setdefault(name, set()).add(value)
+            return result
+
+        self._branching.outcomes(reset)
+        return values
 
     @contextlib.contextmanager
     def _no_other_draws(self, what: str) -> Iterator[None]:
@@ -210,7 +234,7 @@ class StateSearch:
         with self._no_other_draws("step"):
             steps = [self._merged(functools.partial(self._stepped, state, action)) for action in actions]
         if state.number.bit_count() == 1:  # 1, 2, 4, 8 ...
-            self._check_resets(state)
+            self._check_resets(state.copy)
         if state.number % _SAMPLED:
             self._num_bytes -= len(state.copy)
             state.copy = b""
@@ -259,12 +283,16 @@ class StateSearch:
             self._num_bytes += 0 if array is None else array.nbytes
         if is_over and seen not in self.ends:
             self.ends[seen] = self._named()
-        if is_over and (self.is_random or self._branching.has_drawn):
+        is_end = is_over and (self.is_random or self._branching.has_drawn)
+        if is_end and not self._has_new_values():
             return OVER, seen
         try:
             copy = self._snapshots.take()
         except Exception as error:  # whatever the classes in it raise
             raise self.refusal(f"its state cannot be copied: {error}") from error
+        if is_end:
+            self._not_reset.append(copy)
+            return OVER, seen
         short = hashlib.blake2b(copy, digest_size=16).digest()
         if (state := self._by_copy.get(short)) is None:
             key = self._snapshots.key(self.ignore, kinds=True)
@@ -282,6 +310,8 @@ class StateSearch:
         size, (name, place) = 1 + len(self.states), self._named()
         state = State(size - 1, key, self._snapshots.key(self.ignore), seen, depth, copy, name, place)
         self._by_key[key] = state
+        if self._has_new_values():
+            self._not_reset.append(copy)
         self.states.append(state)
         self._num_bytes += len(copy)
         if size > self._most_states:

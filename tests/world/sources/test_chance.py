@@ -467,6 +467,14 @@ def _guess(number: Callable[[World], int]) -> Callable[[World, int], tuple[int, 
     return lambda s, a: (0 * int(s.np_random.integers(2)), float(a == number(s)), False)
 
 
+def _raised(s: World, a: int) -> tuple[int, float, bool]:
+    """A corridor; its right end pays, and seldom raises a level, with which it costs."""
+    at, level = s.at + (1 if a else -1), vars(s).setdefault("level", 0)
+    if at == 20 and s.np_random.random() < 0.05:
+        s.level = 1  # type: ignore[attr-defined]
+    return at, {0: 0.5 + level / 2, 20: 1.0 - 2 * level}.get(at, 0.0), at in (0, 20)
+
+
 def _once(s: World) -> int:
     s.__dict__.setdefault("layout", int(s.np_random.integers(2)))
     return 0
@@ -560,6 +568,10 @@ UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "an iterator outside": ({"move": _guess(lambda s: next(_turns))}, "refers to a cycle"),
     "what cannot be read outside": ({"move": _guess(lambda s: _in_turn(_thread))}, "draws otherwise"),
+    "a rare end that no reset clears": (
+        {"size": 21, "begin": lambda s: 10, "move": _raised},
+        r"a reset does not always lead to the same state \(in level\)",
+    ),
     "a layout that the first reset draws": (
         {"begin": _once, "move": _guess(lambda s: s.layout)},  # type: ignore[attr-defined]
         r"a reset does not always lead to the same state \(in layout\)",

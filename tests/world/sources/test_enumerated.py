@@ -326,6 +326,33 @@ def test_what_changes_with_every_episode_is_named() -> None:
     assert enumerate_env("Counted-v0", {"limit": 9}, ignore=["episodes", "steps"]).num_states == CELLS
 
 
+class Lock(gym.Env[Any, int]):
+    """Ten bits are entered; one code pays, and no reset forgets that it was found."""
+
+    observation_space, action_space = spaces.Discrete(2**11), spaces.Discrete(2)
+
+    def __init__(self) -> None:
+        self.found = False
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[int, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.code = 1
+        return 1, {}
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        self.code = 2 * self.code + int(action)
+        reward = 0.0
+        if self.code == 1024 + 341:
+            reward, self.found = (-1.0 if self.found else 1.0), True
+        return self.code, reward, self.code >= 1024, False, {}
+
+
+def test_a_reset_is_tried_from_every_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(gym.registry, "Lock-v0", gym.envs.registration.EnvSpec("Lock-v0", entry_point=Lock))
+    with pytest.raises(InputError, match=r"a reset does not always lead to the same state \(in found\)"):
+        enumerate_env("Lock-v0")
+
+
 class Ferry(gym.Env[Any, int]):
     """Left, right, wait or board: the pier at the end pays much from `first` to `last`, the start little."""
 
