@@ -49,6 +49,8 @@ _HINTS = (  # a pattern of what is said: what would have been right
         "; in YAML, write whole numbers without a decimal point or exponent",
     ),
     (r"Value '\d+(\.\.|-)\d+'", "; a range, for -m, is range(1,6)"),
+    ("'[a-zA-Z]+' of type 'str' could not be converted to (Float|Integer)", "; must be a number"),
+    ("str is not a ListConfig", "; must be a list, such as [a,b]"),
     (
         r"'tune\.space.* not in struct|tune\.space=",
         "; a search space is a yaml file in conf/tune, or in tune/ of --config-dir, chosen by tune=NAME",

@@ -60,6 +60,8 @@ def find_sheet(name: str) -> Path:
         if not found:
             raise InputError(f"{name}: not a lab sheet; must be from 1 to {len(known)}, or a notebook's path")
         return found[0]
+    if not name.endswith(".ipynb"):
+        raise InputError(f"{name}: not a notebook; give a shipped sheet's number, or the path of a notebook")
     return Path(name)
 
 

@@ -114,6 +114,8 @@ def verdict(summary: Summary) -> str:
     if summary["certified"]:
         return f"certified optimal since step {summary['certified_since_step']:,}{truth}"
     count, names = len(summary["endless_cells"]), summary["endless_states"]
+    if summary["optimal_length"] >= summary["max_episode_steps"]:  # then the optimum does not end either
+        count = 0
     loops = circles_text(count, names, summary["timeout_probability"])
     return f"not optimal: regret {summary['regret']:.3g}{loops}{truth}"
 

@@ -183,6 +183,13 @@ def test_a_goal_that_is_reached_more_often_for_less_is_explained() -> None:
     assert line.endswith("0.9863   more often than the optimum, but with less value")
 
 
+@pytest.mark.parametrize("length", [8.0, 100.0])
+def test_a_loop_is_a_reason_unless_the_optimum_never_ends_either(length: float) -> None:
+    summary = USUAL | {"certified": False, "endless_cells": [[0, 0]], "endless_states": ["state 0"]}
+    summary |= {"timeout_probability": 1.0, "optimal_length": length}
+    assert ("loops until the step limit" in summary_text(summary, "x")) == (length < 100)
+
+
 def test_the_list_of_a_sweeps_jobs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
