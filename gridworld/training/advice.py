@@ -49,12 +49,11 @@ def _commands(saved: SavedRun, place: str) -> Iterator[list[str]]:
     """(why, command) of what may help."""
     run, config = saved.run, saved.config
     words = [word for word in saved.overrides if _key(word) not in _REPLACED]
-    if saved.omission:  # then words of its command line are missing
-        pass
-    elif config.recipe is None and (env := _world_with_recipe(config)) is not None:
+    is_open = config.recipe is None and not saved.omission  # then words of its command line are missing
+    if is_open and (env := _world_with_recipe(config)) is not None:
         own = [word for word in words if _key(word).partition(".")[0] not in ("env", "experiment", "agent")]
         yield ["its recipe:", _train([f"agent={config.agent.name}", f"env={env}", *own])]
-    elif config.recipe is None and config.preset in (AUTO, "none") and "experiment" not in map(_key, words):
+    elif is_open and config.preset in (AUTO, "none") and "experiment" not in map(_key, words):
         preset = fitting_preset(config, lambda: saved.mdp)
         yield from [[f"for {preset} worlds:", _train([*words, f"preset={preset}"])]] if preset else []
     yield [_WHY, f"{command('diagnose')} {place}"]

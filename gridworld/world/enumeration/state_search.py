@@ -144,7 +144,6 @@ class StateSearch:
                     late.steps = ()
                 del self.states[size:]
                 break
-            self._check_first_resets()
             for step in itertools.chain.from_iterable(state.steps):
                 following = self.states[step.following]  # of an end, any
                 if not (step.terminated or step.truncated or following.is_open):
@@ -188,10 +187,11 @@ class StateSearch:
 
     def _check_first_resets(self) -> None:
         """A reset must lead to the same after each value that an attribute has, in ends too, by one draw."""
-        while self._not_reset:
-            copy = self._not_reset.pop()
-            if self._branching.first(functools.partial(self._reset, copy))[:2] != self.starts[0][1:3]:
-                self._refuse_reset(copy)
+        with self._no_other_draws("reset"):
+            while self._not_reset:
+                copy = self._not_reset.pop()
+                if self._branching.first(functools.partial(self._reset, copy))[:2] != self.starts[0][1:3]:
+                    self._refuse_reset(copy)
 
     def _check_resets(self, copy: bytes) -> None:
         """A reset must lead to the same, whatever it draws."""
@@ -233,6 +233,8 @@ class StateSearch:
         actions = range(self.num_actions)
         with self._no_other_draws("step"):
             steps = [self._merged(functools.partial(self._stepped, state, action)) for action in actions]
+        if self._not_reset:
+            self._check_first_resets()
         if state.number.bit_count() == 1:  # 1, 2, 4, 8 ...
             self._check_resets(state.copy)
         if state.number % _SAMPLED:

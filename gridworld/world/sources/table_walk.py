@@ -11,7 +11,7 @@ Reference: J. Ville, Étude critique de la notion de collectif, 1939.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from fractions import Fraction
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -170,12 +170,9 @@ class _Walker:
             if getattr(self.real.unwrapped, "s", None) != self._state:
                 return False
             state, action = divmod(row, self.mdp.num_actions)
-            if self._possible(state, action) & self._possible(self._state, action):
+            if self._row(state, action).keys() & self._row(self._state, action).keys():
                 continue
-            self._set(state)
-            observation, reward, terminated, *_ = self.real.step(action)
-            found = self._shown(observation), float(reward), bool(terminated)
-            if found not in self._possible(state, action):
+            if self._stepped(state, action) not in self._row(state, action):
                 return False
             proven += 1
             if proven == _PROBES:
@@ -186,42 +183,43 @@ class _Walker:
         self.real.unwrapped.s = state  # type: ignore[attr-defined]
         self._state = state
 
-    def _possible(self, state: int, action: int) -> set[tuple[int, float, bool]]:
-        tables = self.table.next_state, self.table.reward, self.table.terminated
-        possible = self.table.probability[state, action] > 0
-        return set(zip(*(each[state, action][possible].tolist() for each in tables), strict=True))
+    def _stepped(self, state: int, action: int) -> tuple[int, float, bool]:
+        """The outcome of an action in a state that is set; it is not counted."""
+        self._set(state)
+        observation, reward, terminated, *_ = self.real.step(action)
+        return self._shown(observation), float(reward), bool(terminated)
+
+    def _row(self, state: int, action: int) -> dict[tuple[int, float, bool], Fraction]:
+        """The possible outcomes of a row of the table, with their probabilities."""
+        table, found = self.table, dict[tuple[int, float, bool], Fraction]()
+        tables = table.probability, table.next_state, table.reward, table.terminated
+        for chance, *outcome in zip(*(each[state, action].tolist() for each in tables), strict=True):
+            if chance > 0:
+                following, reward, terminated = outcome
+                key = following, reward, terminated
+                found[key] = found.get(key, Fraction(0)) + Fraction(chance)
+        return found
 
     def try_outcomes(self) -> None:
         """Try all that resets and rows draw from `np_random`, as long as nothing is drawn elsewhere."""
-        own, tables = self.real.unwrapped, (self.table.next_state, self.table.reward, self.table.terminated)
+        own = self.real.unwrapped
         generator, branching = own.np_random, Branching(self.mdp.name)
-
-        def step(state: int, action: int) -> tuple[int, float, bool]:
-            self._set(state)
-            observation, reward, terminated, *_ = self.real.step(action)
-            return self._shown(observation), float(reward), bool(terminated)
-
         own.np_random = branching  # type: ignore[assignment]
         try:
-            starts = enumerate(self.table.start.tolist())
+            starts = {state: Fraction(chance) for state, chance in enumerate(self.table.start.tolist())}
             is_known = self._try(branching, -1, lambda: self._shown(self.real.reset()[0]), starts)
             for row in self._rng.permutation(self._open).tolist():
                 if not is_known or branching.run > _ROWS:
                     break
                 pair = divmod(row, self.mdp.num_actions)
-                outcomes = zip(*(each[pair].tolist() for each in tables), strict=True)
-                chances = zip(outcomes, self.table.probability[pair].tolist(), strict=True)
-                is_known = self._try(branching, row, partial(step, *pair), chances)
+                is_known = self._try(branching, row, partial(self._stepped, *pair), self._row(*pair))
         finally:
             own.np_random = generator
 
     def _try(
-        self, branching: Branching, row: int, draw: Callable[[], Any], chances: Iterable[tuple[Any, float]]
+        self, branching: Branching, row: int, draw: Callable[[], Any], expected: dict[Any, Fraction]
     ) -> bool:
         """Compare what is drawn, and how likely it is, with a row, -1 for the starts; whether it could be."""
-        expected = dict[Any, Fraction]()
-        for outcome, chance in chances:
-            expected[outcome] = expected.get(outcome, Fraction(0)) + Fraction(chance)
         try:
             found = branching.outcomes(draw)
         except Exception:  # another use of random numbers than can be tried
