@@ -3,7 +3,6 @@
 The process is multiprocessing's fork server, which imports `helpers.warm` when the first script is started.
 """
 
-import functools
 import importlib
 import json
 import multiprocessing
@@ -12,7 +11,6 @@ import signal
 import subprocess
 import threading
 from dataclasses import dataclass, field
-from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,6 +18,8 @@ from typing import Any
 
 TESTS = Path(__file__).resolve().parents[1]
 _FRESH = dict(os.environ)
+_CONTEXT = multiprocessing.get_context("forkserver")
+_CONTEXT.set_forkserver_preload(["helpers.warm"])
 
 
 @dataclass(frozen=True)
@@ -144,26 +144,17 @@ def _start(
 ) -> Any:
     script = str(TESTS.parent / "scripts" / name)
     given = ([script, *words], str(cwd), {**os.environ, **environment}, watched)
-    process = _context().Process(target=_run, args=(out, err, *given), daemon=True)
-    process.start()
-    return process
-
-
-@functools.cache
-def _context() -> Any:
-    """With a server that knows nothing of the test that is the first to ask."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["helpers.warm"])
+    process = _CONTEXT.Process(target=_run, args=(out, err, *given), daemon=True)
     now = dict(os.environ)
     path = os.pathsep.join([str(TESTS), _FRESH.get("PYTHONPATH", "")])
-    try:
+    try:  # the server is started here, at first and where it has died, and knows nothing of the test
         os.environ.clear()
         os.environ.update(_FRESH, PYTHONPATH=path)
-        forkserver.ensure_running()
+        process.start()
     finally:
         os.environ.clear()
         os.environ.update(now)
-    return context
+    return process
 
 
 def _run(out: str, err: "str | Connection[Any, Any]", *given: Any) -> None:

@@ -70,7 +70,7 @@ _LATE = (
     *("hydra._internal.hydra", "hydra._internal.logging_config", "hydra.core.plugins", "encodings.cp437"),
     *("matplotlib.backends.backend_svg", "matplotlib.backends.backend_pdf", "fontTools.subset"),
 )
-_MAIN = process.current_process()
+_MAIN = process.current_process()  # the server's; a fork's own where that could not import this
 _NOT_FOR_FORKS = ".launchers.ray"  # Ray has threads as soon as it is imported
 _IN_RESERVE = 5  # two workers, and some for workers that are killed
 _FIRST = 700  # numbers of files that nobody has
@@ -109,6 +109,7 @@ def _prepare() -> None:
 def run(words: list[str], cwd: str, environment: dict[str, str], watched: tuple[str, str] | None) -> NoReturn:
     """Run a script in this fork; `words` are its command line."""
     vars(process).update(_current_process=_MAIN, _parent_process=None)
+    vars(_MAIN)["_config"]["daemon"] = False  # so that it may have children
     if any(word.endswith("launcher=joblib") for word in words):
         _keep_workers()
 
@@ -270,5 +271,4 @@ def _watch(cwd: str, secret: str, report: str) -> None:
     sys.addaudithook(hook)
 
 
-if process.parent_process() is None:  # in the server, not in one of its forks
-    _prepare()
+_prepare()
