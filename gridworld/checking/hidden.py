@@ -58,6 +58,15 @@ def _several(group: IntArray, outcome: IntArray) -> BoolArray:
     return np.bincount(np.unique(np.stack([group, outcome]), axis=1)[0]) > 1
 
 
+def _histories(time: IntArray, pair: IntArray) -> IntArray:
+    """A number for each step, equal where the episodes so far are."""
+    numbers: dict[tuple[int, int], int] = {}
+    history, last = np.zeros_like(pair), -1
+    for step, (start, each) in enumerate(zip((time == 0).tolist(), pair.tolist(), strict=True)):
+        last = history[step] = numbers.setdefault((-1 if start else last, each), len(numbers))
+    return history
+
+
 def _by_conflict(seen: Seen, pair: IntArray, outcome: IntArray, previous: IntArray) -> tuple[str, str] | None:
     steps = seen.steps
     several = _several(pair, outcome)
@@ -68,6 +77,8 @@ def _by_conflict(seen: Seen, pair: IntArray, outcome: IntArray, previous: IntArr
     by = {_TIME: steps.time, _RESET: steps.episode, _BEFORE: previous}
     if seen.replays.plays and all(each[0] == seen.replays.plays[0][0] for each in seen.replays.plays):
         del by[_RESET]  # other seeds change nothing
+    elif _several(_histories(steps.time, pair), outcome).any():
+        cause, by = _RESET, {}  # all that could be seen was the same
     for name, context in by.items():
         group = _numbers(pair[inside], context[inside])
         again = np.bincount(group) > 1

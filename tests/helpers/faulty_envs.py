@@ -289,6 +289,24 @@ class HiddenGoal(TwoGoals):
     is_shown = False
 
 
+class ShownCard(TwoGoals):
+    """Five guesses at which of two cards was drawn at reset; it shows the card."""
+
+    def step(self, action: Any) -> Result:
+        self.place += 1
+        paid = float(bool(action) == (self.goal > 0))
+        return self.show(), paid, self.place == self.size - 1, False, {}
+
+    def reset(self, **kwargs: Any) -> Start:
+        super().reset(**kwargs)
+        self.place = 0
+        return self.show(), {}
+
+
+class HiddenCard(ShownCard):
+    is_shown = False
+
+
 class Moody(Slippery):
     """Actions are reversed after a slip until the next one, which it does not show."""
 
@@ -403,6 +421,7 @@ FAULTS: tuple[tuple[Any, Any, str, str], ...] = (
     (Walk, Hasty, "markov", "the step count"),
     (Walk, Memory, "markov", "the step before"),
     (TwoGoals, HiddenGoal, "markov", "what is drawn at reset"),
+    (ShownCard, HiddenCard, "markov", "what is drawn at reset"),
     (OpenlyMoody, Moody, "markov", "the step before"),
     (Cart, BlindCart, "markov", "unexplained"),
     (Near, Far, "discount", "399 steps away"),
