@@ -83,10 +83,12 @@ class Diagnosis:
 
     def sentence(self) -> str:
         """The verdict in one sentence."""
-        if not self.findings:
-            return "Certified optimal: there is no regret to explain."
-        first, share = self.findings[0], self.shares[0]
         regret = self.split.score.regret
+        if self.split.score.certified:
+            return "Certified optimal: there is no regret to explain."
+        if not self.findings:
+            return f"The regret of {regret:.3g} is too small to be split into causes."
+        first, share = self.findings[0], self.shares[0]
         part = "The" if share > 1 - 1e-3 else f"{share:.0%} of the"
         return f"{part} regret of {regret:.3g}: {first.why}."
 
@@ -120,7 +122,7 @@ def diagnose(run: Evidence) -> Diagnosis:
 
 def _offers(run: Evidence, findings: tuple[Finding, ...]) -> tuple[tuple[str, ...], ...]:
     """The run's own words with a change each: those of the first cause, then one of each other."""
-    if run.overrides is None:
+    if run.overrides is None or not findings:
         return ()
     first, others = findings[0].changes, [word for each in findings[1:] for word in each.changes[:1]]
     changes = list(dict.fromkeys((*first, *others)))[:_MOST_CHANGES]

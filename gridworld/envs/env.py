@@ -46,7 +46,8 @@ class GridWorldEnv(gym.Env[int, int]):
     `step_reward` (default 0) plus the reward of the cell entered: goal +1, trap -1, any other 0.
 
     ## Starting State
-    The cell marked as the start; one of them, drawn uniformly, where there are several.
+    The cell marked as the start; one of them, drawn uniformly, where there are several. With `mdp`, its own
+    distribution over starts.
 
     ## Episode End
     A goal or a trap terminates. A step after that returns `(state, 0.0, True, False, {})` and changes
@@ -153,7 +154,9 @@ class GridWorldEnv(gym.Env[int, int]):
         """
         super().reset(seed=seed)
         starts = self.mdp.start_states
-        self._state = int(starts[int(self.np_random.random() * len(starts)) if len(starts) > 1 else 0])
+        if len(starts) > 1:
+            starts = self.mdp.drawn_starts(self.np_random.random(1))
+        self._state = int(starts[0])
         if self.render_mode == "human":
             self._show()
         return self._state, {}

@@ -261,9 +261,9 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         return self.np_random.random(len(situations))
 
     def _restart(self, which: NDArray[np.intp]) -> None:
-        starts: Any = self.mdp.start_states
+        starts = self.mdp.start_states
         if len(starts) > 1:
-            starts = starts[self.mdp.start_index(self.draw_numbers(which, np.zeros_like(which)))]
+            starts = self.mdp.drawn_starts(self.draw_numbers(which, np.zeros_like(which)))
         self._state[which] = starts
         self._elapsed[which] = 0
 

@@ -16,7 +16,7 @@ from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.world.enumeration.memoryless import aliased, cost_of_own_observation
-from gridworld.world.evaluation import REGRET_TOLERANCE, Evaluator, fitting_discounts, score_of_optimum
+from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
 
 _QUICKLY_SOLVED = 6000  # outcomes of all states and actions
@@ -119,9 +119,10 @@ def memory_note(config: TrainConfig, mdp: Mdp) -> str | None:
     if mdp.probability.size <= _QUICKLY_SOLVED:
         with contextlib.suppress(InputError):  # no finite optimum
             cost = cost_of_own_observation(mdp, config.evaluation.gamma)
+            judge = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
     if cost is None:
         loses = "is at best as good as the optimum, which is with memory"
-    elif cost <= REGRET_TOLERANCE:
+    elif cost <= judge.tolerance:
         loses = "can be optimal all the same"
     else:
         loses = f"has a regret of at least {cost:.4g}, if it is deterministic"

@@ -138,8 +138,11 @@ class Chain:
             total += visits[:-1].sum(axis=0) @ counted
             steps += len(visits) - 1
             mass = visits[-1]
-        goal, trap = float(mass[self.mdp.goal].sum()), float(mass[self.mdp.trap].sum())
-        return Outcome(goal, trap, float(mass[live].sum()), float(total[1]), float(total[0]))
+        # sums of shares, which rounding may take beyond their ranges
+        goal, trap, going = (
+            min(float(mass[part].sum()), 1.0) for part in (self.mdp.goal, self.mdp.trap, live)
+        )
+        return Outcome(goal, trap, going, float(total[1]), min(float(total[0]), float(max_steps)))
 
     @in_one_thread()
     def discounted_return(self, max_steps: int, gamma: float) -> float:

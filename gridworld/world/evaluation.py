@@ -18,7 +18,9 @@ from gridworld.world.solver import Solution, solved
 
 _USUAL_DISCOUNTS = (0.8, 0.9, 0.95, 0.97, 0.99)
 _QUICKLY_SOLVED = 20_000  # outcomes of all states and actions: a few tenths of a second
-REGRET_TOLERANCE = 1e-6  # relative; a detour of one step costs at least 1 % at the default discount
+# Relative to the optimum's discounted absolute rewards from the start; a detour of one step costs at least
+# 1 % at the default discount. Where the optimum earns and pays nothing, it is the rounding of a reward.
+REGRET_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +70,7 @@ class Evaluator:
         solution: the optimum under the discount.
         optimal_value: its value, in expectation over starts.
         optimum: the outcome of an episode of `optimal_policy`.
+        tolerance: the regret up to which a policy is certified.
 
     Raises:
         InputError: no finite optimum, see `value_iteration`.
@@ -79,6 +82,9 @@ class Evaluator:
         with telling_if_slow(f"solving the world, {mdp.num_states:,} states"):
             self.solution: Solution = solved(mdp, gamma)
         self.optimal_value = self._at_start(self.solution.v)
+        scale = self._at_start(self.solution.scale)
+        self._earns_nothing = scale == 0
+        self.tolerance = self._rounding() if self._earns_nothing else REGRET_TOLERANCE * scale
         with telling_if_slow(f"following the optimum for up to {max_episode_steps:,} steps"):
             self.optimum: Outcome = Chain(mdp, self.optimal_policy()).outcome(max_episode_steps)
 
@@ -93,10 +99,12 @@ class Evaluator:
             InputError: it is no policy of this world.
         """
         chain = Chain(self.mdp, policy)
-        value = self._at_start(chain.value(self.solution.gamma))
+        gamma = self.solution.gamma
+        # An optimum that earns nothing has no scale beside which a linear system's rounding is small.
+        values = chain.evaluation(gamma).value if self._earns_nothing else chain.value(gamma)
+        value = self._at_start(values)
         regret = 0.0 if value == self.optimal_value else self.optimal_value - value  # both may be -inf
-        certified = regret <= REGRET_TOLERANCE * self._at_start(self.solution.scale)
-        return Score(value, regret, certified, chain.outcome(self.max_episode_steps))
+        return Score(value, regret, regret <= self.tolerance, chain.outcome(self.max_episode_steps))
 
     def discounted_return(self, policy: FloatArray) -> float:
         """The exact expected discounted return of an episode within the step limit, of a policy (S, A)."""
@@ -106,6 +114,12 @@ class Evaluator:
         """The states in which a policy (S, A) may loop for ever, ascending; empty if it always ends."""
         states = Chain(self.mdp, policy).endless_states()
         return [int(state) for state in states if not self.mdp.absorbing[state]]
+
+    def _rounding(self) -> float:
+        """The rounding of the largest reward that an episode can meet."""
+        acting = np.flatnonzero(self.mdp.acting)
+        met = np.abs(self.mdp.reward[acting])[self.mdp.probability[acting] > 0]
+        return float(np.finfo(np.float64).eps * met.max(initial=0.0))
 
     def _at_start(self, values: FloatArray) -> float:
         starts = self.mdp.start_states

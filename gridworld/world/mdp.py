@@ -103,11 +103,13 @@ class Mdp:
         chances = self.start[self.start_states]
         return None if (chances == chances[0]).all() else frozen(np.cumsum(chances)[:-1])
 
-    def start_index(self, draws: FloatArray) -> IntArray:
-        """Which of `start_states` uniform draws (m,) from [0, 1) mean: (m,), integers."""
+    def drawn_starts(self, draws: FloatArray) -> IntArray:
+        """The start states that uniform draws (m,) from [0, 1) mean: (m,)."""
         if self._start_thresholds is None:
-            return (draws * len(self.start_states)).astype(np.intp)
-        return np.searchsorted(self._start_thresholds, draws, side="right")
+            index: IntArray = (draws * len(self.start_states)).astype(np.intp)
+        else:
+            index = np.searchsorted(self._start_thresholds, draws, side="right")
+        return self.start_states[index]
 
     @cached_property
     def trap(self) -> BoolArray:

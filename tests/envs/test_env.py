@@ -68,6 +68,23 @@ def test_the_seed_alone_fixes_the_walk():
     assert walk(env, 2) != first
 
 
+@pytest.mark.parametrize("share", [1e-8, 0.3, 1.0])
+def test_the_env_the_batch_and_the_evaluation_start_alike(share):
+    """Where starts differ in probability: the same walk, and each start as often as is scored."""
+    mdp = compile_mdp(parse("S..S\n.TG.\nS...", "map"), slip=0.3).with_exploring_starts(share)
+    env, batch = GridWorldEnv(mdp=mdp), GridWorldVectorEnv(1, mdp=mdp, max_episode_steps=None)
+    env.reset(seed=5), batch.reset(seed=5)
+    counts = np.zeros(mdp.num_states)
+    for _ in range(4000):
+        state = env.reset()[0]
+        assert batch.reset()[0].tolist() == [state]
+        counts[state] += 1
+    assert (counts[mdp.start == 0] == 0).all()
+    drawn = mdp.start > 0
+    spread = np.sqrt(4000 * mdp.start * (1 - mdp.start))
+    assert (np.abs(counts - 4000 * mdp.start)[drawn] <= 5 * spread[drawn] + 1).all()
+
+
 @pytest.mark.parametrize("make", [GridWorldEnv, GridWorldVectorEnv])
 def test_an_env_takes_a_compiled_world_alone(make):
     mdp = compile_mdp(load("four_rooms"), slip=0.3, step_reward=-0.1)

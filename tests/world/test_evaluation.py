@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.oracle import World, maps
 from helpers.support import configure
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.stats import binom, chi2_contingency
 
@@ -21,6 +21,7 @@ from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_op
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse, shipped_layouts
 from gridworld.world.mdp import Mdp
+from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 
 CLASSIC = Evaluator(compile_mdp(load("classic")), 0.99, 100)
 
@@ -158,6 +159,48 @@ def test_a_certificate_is_relative_on_far_goals() -> None:
     still = one_hot_policy(np.zeros(2002, dtype=int), 4)
     assert evaluator.score(still).regret < 1e-6  # a tiny value, yet
     assert not evaluator.score(still).certified
+
+
+@given(
+    world=maps(),
+    slip=st.sampled_from([0.0, 0.1, 0.3]),
+    trap=st.sampled_from([-1.0, -1e-80, -1e80]),
+    gamma=st.sampled_from([0.0, 0.9, 0.99, 1.0]),
+)
+@example(world=["G..S", "T.TT"], slip=0.3, trap=-1.0, gamma=0.99)
+def test_where_the_optimum_earns_nothing_it_is_certified_and_nothing_is_worth_more(
+    world: list[str], slip: float, trap: float, gamma: float
+) -> None:
+    """Penalties only: an optimum that meets none has no scale that a tolerance could be relative to."""
+    mdp = compile_mdp(parse("\n".join(world), "random"), slip, 0.0, 0.0, trap)
+    evaluator = Evaluator(mdp, gamma, 100)
+    best = evaluator.score(evaluator.optimal_policy())
+    assert best.certified
+    starts = mdp.start_states
+    for policy in (evaluator.optimal_policy(), np.full((mdp.num_states, 4), 0.25)):
+        score = evaluator.score(policy)
+        shares = score.outcome.goal, score.outcome.trap, score.outcome.timeout
+        assert all(0 <= share <= 1 for share in shares)
+        assert 0 <= score.outcome.expected_length <= 100
+        if evaluator.solution.scale[starts].max() == 0:
+            assert score.value <= 0 <= score.regret
+            assert not (score.certified and gamma >= 0.9 and score.outcome.trap > 1e-9)
+
+
+def test_only_rounding_is_allowed_where_the_optimum_earns_nothing() -> None:
+    """A policy that falls once in a million times is not optimal, whatever a reward out of reach is."""
+    outcomes = Outcomes(
+        next_state=np.zeros((2, 2, 2), dtype=int),
+        probability=np.array([[[1, 0], [1 - 1e-6, 1e-6]], [[1, 0], [1, 0]]]),
+        reward=np.array([[[0.0, 0], [0, -1]], [[1e9, 0], [1e9, 0]]]),  # in the second no episode ever is
+        terminated=np.ones((2, 2, 2), dtype=bool),
+        start=np.array([1.0, 0]),
+    )
+    evaluator = Evaluator(mdp_from_outcomes("fall", outcomes), 0.99, 100)
+    number = evaluator.mdp.num_states
+    scores = [evaluator.score(one_hot_policy(np.full(number, action), 2)) for action in (0, 1)]
+    assert [score.certified for score in scores] == [True, False]
+    assert 0 < evaluator.tolerance < 1e-15
 
 
 def test_an_episode_is_the_policys_own_walk() -> None:

@@ -205,8 +205,9 @@ export function outcome(world, policy, limit) {
     for (const at of used) after[next[at]] += mass[Math.floor(at / chain.perState)] * chain.weight[at];
     mass = after;
   }
-  const [goal, ended, timeout] = sums(mass, [s => world.goal[s], s => terminal[s], isLive]);
-  return { goal, trap: ended - goal, timeout, length };
+  const isTrap = s => terminal[s] && !world.goal[s];
+  const [goal, trap, timeout] = sums(mass, [s => world.goal[s], isTrap, isLive]).map(x => Math.min(x, 1));
+  return { goal, trap, timeout, length: Math.min(length, limit) };
 }
 
 /** The regret of a policy (S, A) by state: discounted visits, what each loses, and their product. */
