@@ -31,7 +31,7 @@ from gridworld.base.console import tell_error
 from gridworld.base.errors import EXIT_CODE, InputError
 from gridworld.base.user_input import called_from, limited
 from gridworld.commands.manual import manual
-from gridworld.config.compose import VERSION_BASE, completed, register_schemas, to_config
+from gridworld.config.compose import VERSION_BASE, completed, refuse_unused, register_schemas, to_config
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import (
     conf_folder,
@@ -124,6 +124,7 @@ class RefuseUsedFolders(Callback):
         for word in config.hydra.overrides.hydra:
             if re.match(r"\+*hydra[./](launcher|sweeper)\b", word):
                 raise InputError(f"{word}: applies to sweeps only; add -m, or leave it out")
+        refuse_unused(config.hydra)
         folder = Path(config.hydra.run.dir).absolute()  # a job may change the current folder
         check_free(Path(config.hydra.run.dir))
         if config.hydra.output_subdir is not None:

@@ -8,7 +8,7 @@ import functools
 import re
 import secrets
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -37,6 +37,11 @@ if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
 VERSION_BASE = "1.3"
 _LONGEST_NAME = 100  # characters of a job's folder
 _ONE_AT_A_TIME = threading.RLock()  # Hydra composes with variables of the process
+_BASIC = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+_OURS = {  # by their names in conf/hydra
+    "launcher": {"basic": _BASIC} | {each: f"gridworld.sweeps.launchers.{each}" for each in LAUNCHER_SCHEMAS},
+    "sweeper": {"gridworld": SweepConfig._target_},
+}
 _NO_SINGLE_RUN = {  # with these of Hydra's options, a command line is not that of a run in the shipped `conf`
     *("-m", "--multirun", "--hydra-help", "--info", "-i", "--shell-completion", "-sc"),
     *("--config-name", "-cn", "--config-path", "-cp", "--experimental-rerun"),
@@ -54,7 +59,7 @@ def compose(words: Sequence[str]) -> TrainConfig:
     try:
         with _leaving_hydra_as_it_was():
             _store_schemas()
-            return compose_run(conf_folder(), [*search_path(own), *values])[0]
+            return compose_run([*search_path(own), *values])[0]
     except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
         raise InputError(sentence(error)) from None
 
@@ -82,25 +87,39 @@ def named_world(name: str, **settings: Any) -> Mdp:
     return dataclasses.replace(mdp, max_episode_steps=env.step_limit(mdp))
 
 
-def compose_whole(conf: Path, name: str, words: Sequence[str]) -> DictConfig:
+def compose_whole(name: str, words: Sequence[str]) -> DictConfig:
     """Compose `name` with Hydra's own part."""
-    with hydra.initialize_config_dir(version_base=VERSION_BASE, config_dir=str(conf)):
+    with hydra.initialize_config_dir(version_base=VERSION_BASE, config_dir=str(conf_folder())):
         return hydra.compose(name, prepared(words), return_hydra_config=True)
 
 
-def compose_run(conf: Path, words: Sequence[str]) -> tuple[TrainConfig, DictConfig, list[str]]:
+def compose_run(words: Sequence[str], but: Collection[str] = ()) -> tuple[TrainConfig, DictConfig, list[str]]:
     """Compose a run's settings with the preset that the world needs; Hydra's own part; the preset's words."""
     hydras: list[DictConfig] = []
 
     def again(more: list[str]) -> TrainConfig:
-        whole = compose_whole(conf, "train", [*words, *more])
+        whole = compose_whole("train", [*words, *more])
         hydras.append(whole.hydra)
         return to_config(whole)
 
     config, chosen = again([]), list[str]()
+    refuse_unused(hydras[0], but)
     if hydras[0].mode is not RunMode.MULTIRUN:
         config, chosen = with_preset(config, prepared(words), again)
     return config, hydras[bool(chosen)], chosen
+
+
+def refuse_unused(own: DictConfig, but: Collection[str] = ()) -> None:
+    """Refuse a launcher or a sweeper that is not ours, or one of `but`; `own` is Hydra's part."""
+    runtime = own.runtime
+    files = [Path(s.path, g, f"{c}.yaml") for s in runtime.config_sources for g, c in runtime.choices.items()]
+    for kind, ours in _OURS.items():
+        known, target = sorted(ours.keys() - set(but)), own[kind].get("_target_")
+        if target not in map(ours.get, known):
+            word = f"hydra/{kind}={runtime.choices[f'hydra/{kind}']}"
+            found = [f", in {at}" for at in files if at.is_file() and f"{kind}:" in at.read_text("utf-8")]
+            where = found[0] if found and word not in own.overrides.hydra else ""
+            raise InputError(f"{word}{where}: {target} is not used here; choose from {', '.join(known)}")
 
 
 def completed(words: Sequence[str]) -> list[str]:
@@ -113,7 +132,7 @@ def completed(words: Sequence[str]) -> list[str]:
         return found
     chosen: list[str] = []
     with contextlib.suppress(Exception):  # Hydra composes again, and says what is wrong
-        chosen = compose_run(conf_folder(), [*search_path(own), *values])[2]
+        chosen = compose_run([*search_path(own), *values])[2]
     end = places[-1] + 1 if places else len(found)  # options may follow
     return [*found[:end], *chosen, *found[end:]]
 

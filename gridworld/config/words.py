@@ -40,6 +40,7 @@ _SENTENCES = (  # a pattern of a message of Hydra's: what is said instead
         r"Multiple values for (\S+)\. To override a value use 'override \S+: (.*)'",
         "+{0}={1}: {0} is always chosen, so it takes no plus; write {0}={1}",
     ),
+    (r"Invalid plugin 'gridworld\.", "hydra/sweeper: another one needs hydra/launcher=basic, or its own"),
 )
 _HINTS = (  # a pattern of what is said: what would have been right
     ("Ambiguous value", "; to run one job for each of the values, add -m"),

@@ -3,6 +3,8 @@
 The command lines and their sentences are in `bad_input.txt`.
 """
 
+import copy
+import dataclasses
 import json
 import re
 import sys
@@ -14,10 +16,12 @@ import pytest
 from cases import table
 from helpers.own_class import any_class
 from helpers.support import NO_FILES, ROOT, SHORT, configure, train_in
+from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException
 
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import sealed
+from gridworld.commands.train import FULL_ERROR
 from gridworld.config.words import sentence
 from gridworld.training.train import train
 
@@ -170,6 +174,81 @@ def test_a_launcher_that_is_not_installed_names_its_extra(
     told = f"{package} is not installed; pip install -e '{ROOT}[{launcher}]'"
     line = f"train.py -m seed=0,1 hydra/launcher={launcher}"
     assert refusal(line) == f"error: hydra/launcher={launcher}: {told}"
+
+
+COMMANDS = {
+    "train.py -m seed=0,1": "basic, forks, joblib, ray, slurm",
+    "train.py": "basic, forks, joblib, ray, slurm",
+    "tune.py": "basic, forks, joblib",
+}
+CHOICES = {  # of a launcher that is not ours, and of a sweeper
+    "launcher: submitit_slurm": "hydra_plugins.submitit.SlurmLauncher",
+    "launcher: in_a_file": "my_cluster.Launcher",
+    "launcher: nobody": "",
+    "sweeper: basic": "hydra._internal.core_plugins.basic_sweeper.BasicSweeper",
+}
+
+
+@dataclasses.dataclass
+class OfAPlugin:
+    """What hydra-submitit registers, in short."""
+
+    _target_: str = "hydra_plugins.submitit.SlurmLauncher"
+    partition: str | None = None
+
+
+def an_experiment(folder: Path, choice: str, is_sweep: bool = False) -> Path:
+    """A folder for `--config-dir` whose experiment `mine` makes the choice of Hydra's group."""
+    file = folder / "conf" / "experiment" / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    sweep = "hydra: {mode: MULTIRUN}\n" if is_sweep else ""
+    file.write_text(f"# @package _global_\ndefaults:\n  - override /hydra/{choice}\n{sweep}")
+    return file
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_launcher_that_would_not_be_used_is_refused_wherever_it_is_set(
+    command: str, choice: str, tmp_path: Path, refusal: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = ConfigStore.instance()
+    monkeypatch.setattr(store, "repo", copy.deepcopy(store.repo))
+    store.store(group="hydra/launcher", name="submitit_slurm", node=OfAPlugin)
+    file, (kind, name) = an_experiment(tmp_path, choice, command == "tune.py"), choice.split(": ")
+    own = tmp_path / "conf" / "hydra" / "launcher" / "in_a_file.yaml"
+    own.parent.mkdir(parents=True)
+    own.write_text("_target_: my_cluster.Launcher\n")
+    word = f"hydra/{kind}={name}"
+    for by, where in ((word, ""), ("experiment=mine", f", in {file}")):
+        monkeypatch.delenv(FULL_ERROR, raising=False)  # which a command sets for Hydra
+        told = refusal(f"{command} agent=q_learning --config-dir {tmp_path / 'conf'} {by}")
+        if name == "nobody":
+            assert told.startswith(f"error: {word}: no such choice; choose from basic, forks,")
+        elif command == "train.py" and not where:
+            assert told == f"error: {word}: applies to sweeps only; add -m, or leave it out"
+        elif kind == "sweeper" and "-m" in command:  # Hydra would use it, but it cannot use our launchers
+            assert told == "error: hydra/sweeper: another one needs hydra/launcher=basic, or its own"
+        else:
+            known = COMMANDS[command] if kind == "launcher" else "gridworld"
+            assert told == f"error: {word}{where}: {CHOICES[choice]} is not used here; choose from {known}"
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_launcher_of_ours_is_used_wherever_it_is_set(
+    tmp_path: Path, refusal: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that is not on this machine says so; a study has none but this machine."""
+    file = an_experiment(tmp_path, "launcher: slurm")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    words = f"agent=q_learning --config-dir {tmp_path / 'conf'}"
+    for by, where in (("hydra/launcher=slurm", ""), ("experiment=mine", f", in {file}")):
+        monkeypatch.delenv(FULL_ERROR, raising=False)
+        told = refusal(f"train.py -m seed=0,1 {words} {by}")
+        assert told.startswith("error: hydra/launcher=slurm: no sbatch on this machine; start")
+        told = refusal(f"tune.py {words} {by}")
+        module = "gridworld.sweeps.launchers.slurm"
+        known = "choose from basic, forks, joblib"
+        assert told == f"error: hydra/launcher=slurm{where}: {module} is not used here; {known}"
 
 
 def test_slurm_is_started_where_it_is(

@@ -51,7 +51,7 @@ def test_a_winner_is_the_same_by_hydra_and_as_data(agent: str, tmp_path: Path) -
     choices |= {"tuned": "none" if agent == "ppo" else f"cliff_{agent}"}
     words = [*(f"{group}={choice}" for group, choice in choices.items()), *WINNERS[agent]]
     path = write_recipe(tmp_path, (), choices, configure(*words), "a winner")
-    by_hydra, *_ = compose_run(CONF, ["experiment=winner", *search_path([tmp_path])])
+    by_hydra, *_ = compose_run(["experiment=winner", *search_path([tmp_path])])
     assert of_words(f"recipe={path}") == by_hydra == configure(*words)
     assert of_words(f"recipe={tmp_path}") == configure(*words)
 

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from gridworld.base.console import repeating
 from gridworld.base.errors import InputError, install_command
 from gridworld.base.processes import LostError, Processes, can_fork, worker_count
+from gridworld.config.compose import refuse_unused
 from gridworld.config.train import check_bounds
 from gridworld.sweeps.folder import STOP
 from gridworld.sweeps.job import StopSweep, Worker
@@ -43,6 +44,7 @@ class Launch:
 
 def launcher_settings(config: DictConfig) -> tuple[str, dict[str, Any]]:
     """The launcher that is chosen, and its settings. Raises `InputError` where it cannot work."""
+    refuse_unused(config.hydra)
     settings: Any = OmegaConf.to_object(config.hydra.launcher)
     check_bounds(settings, "hydra.launcher.")
     own = dataclasses.asdict(settings)

@@ -46,7 +46,6 @@ from gridworld.config.fields import Effect
 from gridworld.config.recipe_file import IN_A_STUDY, TRUST, literal, overrides
 from gridworld.config.settings import ON_RESULT, flat, with_effects
 from gridworld.config.train import TrainConfig
-from gridworld.config.words import conf_folder
 from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.report.writer import write_over_seeds
 from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, check_writable, claimed, shell_path, shown
@@ -264,7 +263,7 @@ def write_recipe(
     """
 
     def composed(words: list[str], *more: Path) -> dict[str, Any]:
-        return _relevant(compose_run(conf_folder(), [*words, *search_path((*conf, *more))])[0])
+        return _relevant(compose_run([*words, *search_path((*conf, *more))])[0])
 
     bare = dict(flat(composed([f"{group}={choice}" for group, choice in choices.items()])))
     values = OmegaConf.create()

@@ -50,7 +50,7 @@ from gridworld.config.recipe_file import CHOSEN, with_recipe
 from gridworld.config.settings import effect_of
 from gridworld.config.sweep import DimensionConfig, TuneConfig
 from gridworld.config.train import AUTO, TrainConfig, check_bounds
-from gridworld.config.words import conf_folder, sentence
+from gridworld.config.words import sentence
 from gridworld.sweeps.tune.objective import Objective, Values, with_values
 from gridworld.training.setup import check_settings
 from gridworld.world.mdp import Mdp
@@ -113,7 +113,7 @@ def compose_study(words: Sequence[str], conf: tuple[Path, ...] = ()) -> StudySpe
     register_schemas()
     try:
         of_search, of_run = _divide(with_recipe(words))
-        base, own, _ = compose_run(conf_folder(), [*of_run, *search_path(conf)])
+        base, own, _ = compose_run([*of_run, *search_path(conf)], but=("ray", "slurm"))  # it runs here
         choices = {group: str(own.runtime.choices[group]) for group in CHOSEN}
         if choices["preset"] == AUTO:  # nothing was chosen, and nothing is to be for the winner
             choices["preset"] = "none"
@@ -121,16 +121,16 @@ def compose_study(words: Sequence[str], conf: tuple[Path, ...] = ()) -> StudySpe
             choices["tuned"] = "none"
         if not any(re.match(r"[+~]*tune(?!\.)", word) for word in of_search):
             of_search.append(f"tune={choices['agent']}")
-        search = compose_whole(conf_folder(), "tune", [*of_search, *search_path(conf)])
+        search = compose_whole("tune", [*of_search, *search_path(conf)])
         space_name = str(search.hydra.runtime.choices["tune"])
         settings = cast(TuneConfig, OmegaConf.to_object(search.tune))
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+    except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
         raise InputError(sentence(error)) from None
     settings = _completed(settings, choices["agent"], base)
     space = SearchSpace(settings.space, space_name)
     space.check(base, check_settings(base))
     words = [f"{group}={choice}" for group, choice in choices.items()]
-    words += [word for word in of_run if word.partition("=")[0] not in (*CHOSEN, "seed")]
+    words += [word for word in of_run if word.partition("=")[0] not in (*CHOSEN, "seed", "hydra/launcher")]
     spec = StudySpec(conf, base, choices, words, settings, space)
     if spec.held_out.stop > _LARGEST_SEED:
         raise InputError(f"seed={base.seed}: leaves no room for the seeds after it, below 2**32")
