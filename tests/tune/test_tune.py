@@ -78,6 +78,18 @@ def test_its_winner_is_a_recipe_of_train_py(studied: Path) -> None:
         assert config["total_timesteps"] == 1500
 
 
+def test_a_study_of_a_world_by_its_id_leaves_a_recipe_that_trains_there(tmp_path: Path) -> None:
+    world = ("env=gymnasium", "env.id=FrozenLake-v1", "env.kwargs.is_slippery=false", "tuned=none")
+    done = script("tune.py", *QUICK, *world, "tune.trials=2", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    winner = json.loads((tmp_path / "study" / "study.json").read_text())["winner"]["values"]
+    trained = script("train.py", "recipe=study", "hydra.run.dir=run", cwd=tmp_path)
+    assert trained.returncode == 0, trained.stderr
+    config = json.loads((tmp_path / "run" / "manifest.json").read_text())["config"]
+    assert (config["env"]["id"], config["env"]["kwargs"]) == ("FrozenLake-v1", {"is_slippery": False})
+    assert {key: config["agent"][key.removeprefix("agent.")] for key in winner} == winner
+
+
 def test_the_same_line_goes_on_with_the_study(studied: Path) -> None:
     before = rows(studied)
     more = script("tune.py", *QUICK, "tune.trials=8", cwd=studied)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import optuna
 import pytest
+import yaml
 from helpers.hostile import seal
 from helpers.runs_folder import Maker
 from helpers.support import CONF, SHORT, configure
@@ -29,7 +30,11 @@ from test_tune import refused
 from gridworld.base.errors import InputError
 from gridworld.base.processes import LostError, Processes
 from gridworld.base.safe_read import sealed
+from gridworld.config.compose import compose
+from gridworld.config.fields import MISSING
+from gridworld.config.recipe_file import literal
 from gridworld.config.sweep import DimensionConfig
+from gridworld.config.worlds import SOURCES
 from gridworld.sweeps.tune import objective as objective_module
 from gridworld.sweeps.tune.confirmation import (
     HeldOutResults,
@@ -50,6 +55,7 @@ from gridworld.sweeps.tune.objective import (
     with_values,
 )
 from gridworld.sweeps.tune.search import open_study, search
+from gridworld.sweeps.tune.study import write_recipe
 from gridworld.sweeps.tune.study_spec import SearchSpace, StudySpec, compose_study
 from gridworld.training.setup import check_settings
 from gridworld.training.together import run_alone
@@ -101,6 +107,73 @@ def test_a_shipped_space_holds_the_shipped_settings_and_suggests_what_can_train(
     for _ in range(8):
         suggested = asked.space.values(study.ask(asked.space.distributions).params)
         check_settings(with_values(asked.base, suggested))
+
+
+TABLES: dict[str, Any] = {
+    "next_state": [[0, 1], [0, 1]],
+    "reward": [[0.0, 0.0], [0.0, 1.0]],
+    "terminated": [[False, False], [False, True]],
+}
+SETTINGS: dict[str, dict[str, Any]] = {  # of a world of each source
+    "map": {"layout": "my maps/one map.txt", "slip": 0.25},
+    "gymnasium": {"id": "FrozenLake-v1", "kwargs": {"desc": ["SF", "FG"], "is_slippery": False}},
+    "enumerated": {"id": "FrozenLake-v1", "kwargs": {"map_name": "4x4"}, "ignore": ["lastaction"]},
+    "arrays": {"path": "my maps/tables.npz"},
+    "built": {"builder": "gridworld.world.sources.classics.river_swim", "kwargs": {"length": 4}},
+    "river_swim": {"length": 7},
+    "deep_sea": {"size": 3},
+    "combination_lock": {"length": 3, "seed": 1},
+    "random_walk": {"length": 7},
+}
+
+
+# An agent with a setting that every command line has to give, and one that follows from another.
+AN_AGENT = """\
+# @package _global_
+defaults:
+  - /agent/schema/q_learning@agent
+  - override /observation: none
+  - _self_
+agent:
+  name: mine
+  gamma: ???
+  log_interval: ${n_envs}
+"""
+
+
+@pytest.mark.parametrize("given", ["on the command line", "in a file", "in a file that leaves it open"])
+@pytest.mark.parametrize("source", SOURCES)
+def test_the_recipe_of_a_study_in_any_world_is_of_that_world(
+    source: str, given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings, world = SETTINGS[source], {"map": "classic"}.get(source, source)
+    content: dict[str, Any] = {"defaults": [{"override /env/schema@_global_.env": source}]}
+    if given != "on the command line":
+        world = "mine"
+        content |= settings if given == "in a file" else dict.fromkeys(settings, MISSING)
+    monkeypatch.chdir(tmp_path)
+    for path, text in (
+        ("my maps/one map.txt", "S..\n.T.\n..G\n"),
+        ("conf/agent/mine.yaml", AN_AGENT),
+        (
+            "conf/tune/mine.yaml",
+            "# @package tune.space\nagent.learning_rate: {type: float, low: 0.1, high: 1}\n",
+        ),
+        ("conf/env/mine.yaml", yaml.safe_dump(content, sort_keys=False)),
+    ):
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        Path(path).write_text(text)
+    np.savez("my maps/tables.npz", start=[1.0, 0.0], **TABLES)
+    words = ["agent=mine", "agent.gamma=0.9", f"env={world}"]
+    if given != "in a file":
+        words += [f"{'++' * isinstance(v, dict)}env.{k}={literal(v, k)}" for k, v in settings.items()]
+    spec = compose_study(words, (Path("conf"),))
+    winner = with_values(spec.base, {"agent.learning_rate": 0.3})
+    Path("study").mkdir()
+    write_recipe(Path("study"), spec.conf, spec.choices, winner, "a winner")
+    again = compose(["recipe=study", "trust=true", "--config-dir=conf"])
+    assert again == dataclasses.replace(winner, preset="none")
+    assert {key: getattr(again.env, key) for key in settings} == settings
 
 
 def test_choices_that_need_each_other_are_no_mistake() -> None:

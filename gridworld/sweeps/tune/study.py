@@ -41,7 +41,7 @@ from gridworld.base.errors import InputError
 from gridworld.base.processes import Processes, can_fork
 from gridworld.base.safe_read import LARGEST_CSV, file_sha256, read_sealed, sealed
 from gridworld.base.signals import Interrupted, exiting
-from gridworld.config.compose import compose_run, search_path
+from gridworld.config.compose import compose_run, compose_whole, search_path
 from gridworld.config.fields import Effect
 from gridworld.config.recipe_file import IN_A_STUDY, TRUST, literal, overrides
 from gridworld.config.settings import ON_RESULT, flat, with_effects
@@ -265,7 +265,9 @@ def write_recipe(
     def composed(words: list[str], *more: Path) -> dict[str, Any]:
         return _relevant(compose_run([*words, *search_path((*conf, *more))])[0])
 
-    bare = dict(flat(composed([f"{group}={choice}" for group, choice in choices.items()])))
+    chosen = [f"{group}={choice}" for group, choice in choices.items()]
+    plain: Any = OmegaConf.to_container(compose_whole("train", [*chosen, *search_path(conf)]))
+    bare = dict(flat(with_effects(_OF_A_RECIPE, plain)))  # which may lack values, as a world's id
     values = OmegaConf.create()
     for key, value in flat(_relevant(config)):
         if key not in bare or value != bare[key]:
