@@ -311,6 +311,18 @@ def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: P
     assert "its workers were killed" in table
 
 
+def test_a_study_whose_tables_were_cut_short_is_one_study(tmp_path: Path) -> None:
+    """A kill between the table of studies and its index leaves names that need not be unique."""
+    url, space = f"sqlite:///{tmp_path}/study.db", compose_study(["agent=q_learning"]).space
+    optuna.storages.RDBStorage(url)
+    with contextlib.closing(sqlite3.connect(tmp_path / "study.db")) as database:
+        database.execute("DROP INDEX ix_studies_study_name")
+        database.commit()
+    for _ in range(3):
+        open_study(url, "one", {}, space)
+    assert optuna.get_all_study_names(url) == ["one"]
+
+
 def test_a_trial_that_is_worse_than_the_median_is_pruned(tmp_path: Path) -> None:
     values = iter([0.5, 0.4, 0.6, 0.3, 0.7, 0.45, 0.55, 0.2, 0.46, 0.44])
 

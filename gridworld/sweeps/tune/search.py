@@ -99,16 +99,20 @@ def open_study(
     url: str, name: str, about: Mapping[str, Any], space: SearchSpace, must_exist: bool = False
 ) -> optuna.Study:
     """Make the study, or check that the one there is of the same search and can be read."""
-    is_file = url.startswith("sqlite:///")
-    is_gone = must_exist and is_file and not Path(url.removeprefix("sqlite:///")).exists()
+    is_gone = (
+        must_exist and url.startswith("sqlite:///") and not Path(url.removeprefix("sqlite:///")).exists()
+    )
     try:
         storage = None if is_gone else _connect(url)
-        if storage is None or (must_exist and name not in optuna.get_all_study_names(storage)):
+        names = [] if storage is None else optuna.get_all_study_names(storage)
+        if storage is None or (must_exist and name not in names):
             raise InputError(
                 f"{_shown(url)}: does not have the study {name}, which has started; restore its database, "
                 "or choose another tune.folder"
             )
-        study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
+        if name not in names:  # the index of names is missing where making the tables was cut short
+            optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
+        study = optuna.load_study(study_name=name, storage=storage)
         if ABOUT not in study.user_attrs:
             study.set_user_attr(ABOUT, about)
         _check_same(name, study.user_attrs[ABOUT], about)
