@@ -1,7 +1,7 @@
 """Mark a student's notebook of a lab sheet: points and one sentence for each exercise, by exact ground truth.
 
-The notebook runs in a process of its own, with limits on time and memory, away from other files and from TCP
-(Landlock, Linux 5.13 or newer). This does not protect against copied answers, or attacks on the kernel.
+The notebook runs in a process of its own, with limits on time and memory and no others: mark the work of
+people whom you do not trust in a container without the solutions.
 Exit code: 0 if the notebook has all points, 1 if not, 2 for a mistake on the command line.
 """
 

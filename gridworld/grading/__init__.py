@@ -1,10 +1,10 @@
 """Marking the lab sheets of a course: `gridworld grade`.
 
 `sheet` finds a sheet and how it is marked, `work` asks a student's functions, which run in a process of their
-own (`fence`). A sheet's marking is a Python file that uses `exercise`, `Work` and `WrongAnswerError`.
+own (`notebook`). A sheet's marking is a Python file that uses what is named here.
 """
 
 from gridworld.grading.sheet import exercise
-from gridworld.grading.work import Work, WrongAnswerError
+from gridworld.grading.work import Work, WrongAnswerError, numbers
 
-__all__ = ["Work", "WrongAnswerError", "exercise"]
+__all__ = ["Work", "WrongAnswerError", "exercise", "numbers"]

@@ -1,7 +1,8 @@
 """A student's notebook in a process of its own, asked by plain data over a socket.
 
-What comes back is untrusted: it is read as JSON within bounds, never unpickled, and compared in this process.
-The other process has limits on memory and time (`fence`), and its group ends with it.
+What comes back is read as JSON within bounds, never unpickled, and compared in this process. The other
+process (`notebook`) has limits on time and memory, and its group ends with it. It may read any file: only a
+container keeps it from the solutions.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -27,7 +28,6 @@ from gridworld.world.mdp import FloatArray, Mdp
 
 _TABLES = ("num_states", "num_actions", "next_state", "probability", "reward", "terminal", "start", "number")
 _MOST_STOPPED = 3  # cells; what comes after so many is not run
-_SECONDS_TO_START = 60.0
 _ENVIRONMENT = {
     "PATH": os.defpath,
     "LC_ALL": "C.UTF-8",
@@ -48,20 +48,14 @@ class Work:
         cells: the source of each code cell, by its number.
         seconds: for each cell, and for each exercise.
         memory: bytes that its process may address.
-        hidden: folders that it must not read.
 
     Attributes:
         failed: by the number of a cell, why it could not be run.
-        fenced: whether the system keeps the process away from other files (Linux 5.13 or newer).
     """
 
-    def __init__(
-        self, cells: Mapping[int, str], seconds: float, memory: int, hidden: Sequence[Path] = ()
-    ) -> None:
+    def __init__(self, cells: Mapping[int, str], seconds: float, memory: int) -> None:
         self.failed: dict[int, str] = {}
-        self.fenced = True
-        self._cells, self._seconds = dict(cells), seconds
-        self._settings = {"memory": memory, "hidden": [str(path.resolve()) for path in hidden]}
+        self._cells, self._seconds, self._memory = dict(cells), seconds, memory
         self._process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Self:
@@ -94,15 +88,8 @@ class Work:
         return self._ask(f"`{function}`", {"name": function, "arguments": [*map(_encoded, arguments)]})
 
     def array(self, function: str, *arguments: Any, shape: tuple[int, ...]) -> FloatArray:
-        """Call a function that must return an array of numbers of this shape; see `call`."""
-        found = self.call(function, *arguments)
-        try:
-            array = np.array(found, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise WrongAnswerError(f"`{function}` must return an array of numbers") from None
-        if array.shape != shape:
-            raise WrongAnswerError(f"`{function}` returned the shape {array.shape}, must be {shape}")
-        return array
+        """Call a function that must return finite numbers of this shape; see `call` and `numbers`."""
+        return numbers(f"what `{function}` returned", self.call(function, *arguments), shape)
 
     def value(self, name: str) -> Any:
         """The value of a variable, as plain data; see `call`."""
@@ -115,7 +102,7 @@ class Work:
         self._received, self._number = b"", 0
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-I", "-B", str(Path(__file__).with_name("fence.py"))],
+                [sys.executable, "-I", "-B", str(Path(__file__).with_name("notebook.py")), f"{self._memory}"],
                 stdin=theirs.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
@@ -123,11 +110,6 @@ class Work:
                 env=_ENVIRONMENT | {"HOME": self._folder.name},
                 start_new_session=True,
             )
-        self._until = time.monotonic() + _SECONDS_TO_START
-        try:
-            self.fenced = bool(self._exchange("the notebook", self._settings).get("fenced"))
-        except WrongAnswerError as error:
-            raise InputError(f"{error}, before its first cell; give it more memory") from None
         for number, source in list(self._cells.items()):
             self._until = time.monotonic() + self._seconds
             try:
@@ -181,8 +163,10 @@ class Work:
         return line
 
     def _wait(self) -> None:
-        """Let the next call of the socket wait until the deadline."""
-        self._socket.settimeout(max(0.001, self._until - time.monotonic()))
+        """Let the next call of the socket wait until the deadline, and none begin after it."""
+        if (left := self._until - time.monotonic()) <= 0:
+            raise TimeoutError
+        self._socket.settimeout(left)
 
     def _end(self) -> None:
         if self._process is None:
@@ -192,7 +176,30 @@ class Work:
         self._process.wait()
         self._process = None
         self._socket.close()
-        self._folder.cleanup()
+        with contextlib.suppress(RecursionError):  # of a folder in a folder in a folder ...
+            self._folder.cleanup()
+
+
+def numbers(what: str, found: Any, shape: tuple[int, ...]) -> FloatArray:
+    """The array of finite numbers that plain data is.
+
+    Args:
+        what: begins the sentence of the error.
+        found: numbers, or lists of them; text such as "nan" is none.
+        shape: which it must have.
+
+    Raises:
+        WrongAnswerError: it is something else.
+    """
+    try:
+        array = np.array(found)
+    except ValueError:  # lists of several lengths
+        array = np.array(None)
+    if array.dtype.kind not in "biuf" or not np.isfinite(array).all():
+        raise WrongAnswerError(f"{what} must be finite numbers, in an array of the shape {shape}")
+    if array.shape != shape:
+        raise WrongAnswerError(f"{what} has the shape {array.shape}, must be {shape}")
+    return array.astype(np.float64)
 
 
 def _encoded(value: Any) -> Any:

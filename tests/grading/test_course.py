@@ -44,6 +44,26 @@ WRONG: dict[str, list[tuple[str, str, str]]] = {
         ("return train(NeverTerminated(env),", "return train(env,", "4.6"),
     ],
 }
+NOTHING = """
+import numbers
+import numpy as np
+
+def emptied(found):
+    if isinstance(found, dict):
+        return {name: emptied(each) for name, each in found.items()}
+    if isinstance(found, np.ndarray):
+        return emptied(found.tolist())
+    return [*map(emptied, found)] if isinstance(found, list | tuple) else VALUE
+
+def emptying(function):
+    return lambda *given, **named: emptied(function(*given, **named))
+
+for name, found in list(globals().items()):
+    if getattr(found, "__module__", "") == "__main__" and name not in ("emptied", "emptying"):
+        globals()[name] = emptying(found)
+    elif name.isupper():
+        globals()[name] = emptied(found)
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -112,6 +132,16 @@ def test_a_wrong_answer_costs_its_own_points(
     sheet: str, old: str, new: str, lost: str, tmp_path: Path
 ) -> None:
     assert list(points_lost(sheet, changed(sheet, old, new, tmp_path))) == lost.split()
+
+
+@pytest.mark.parametrize("sheet", SHEETS)
+@pytest.mark.parametrize("value", ["'nan'", "float('nan')", "1j", "None"])
+def test_what_is_no_number_earns_no_points(sheet: str, value: str, tmp_path: Path) -> None:
+    """Each function and variable of a solution gives its form, with something else in place of numbers."""
+    content = json.loads((COURSE / "solutions" / f"{sheet}.ipynb").read_text("utf-8"))
+    content["cells"].append({"cell_type": "code", "source": NOTHING.replace("VALUE", value)})
+    (tmp_path / "mine.ipynb").write_text(json.dumps(content))
+    assert len(points_lost(sheet, tmp_path / "mine.ipynb")) == len(read_exercises(SHEETS[sheet]))
 
 
 def test_a_right_answer_may_look_different(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gridworld import Evaluator, Mdp, compile_mdp
-from gridworld.grading import Work, WrongAnswerError, exercise
+from gridworld.grading import Work, WrongAnswerError, exercise, numbers
 from gridworld.world.chain import Chain
 from gridworld.world.layout import parse
 from gridworld.world.mdp import backup
@@ -44,10 +44,8 @@ def by_hand(work: Work) -> str:
     mdp = compile_mdp(parse("S..G\n", "the corridor"))
     for name, probabilities in (("VALUES_RIGHT", [0, 1, 0, 0]), ("VALUES_COIN", [0, 0.5, 0, 0.5])):
         exact = Chain(mdp, np.tile(np.array(probabilities, dtype=float), (4, 1))).value(0.9)[:3]
-        found = work.value(name)
-        if not isinstance(found, list) or len(found) != 3 or None in found:
-            raise WrongAnswerError(f"`{name}` must have three numbers")
-        wrong = np.flatnonzero(np.abs(np.array(found, dtype=float) - exact) > 1e-5)
+        found = numbers(f"`{name}`", work.value(name), (3,))
+        wrong = np.flatnonzero(np.abs(found - exact) > 1e-5)
         if wrong.size:
             state, given = wrong[0], found[wrong[0]]
             raise WrongAnswerError(f"`{name}`: the value of state {state} is not {given:.6g} to within 1e-5")

@@ -7,7 +7,7 @@ import numpy as np
 from gridworld import Evaluator, Mdp, compile_mdp
 from gridworld.agents.tabular.td_control import epsilon_greedy
 from gridworld.diagnosis.evidence import optimum_of_epsilon
-from gridworld.grading import Work, WrongAnswerError, exercise
+from gridworld.grading import Work, WrongAnswerError, exercise, numbers
 from gridworld.world.chain import Chain
 from gridworld.world.layout import parse
 from gridworld.world.mdp import backup
@@ -64,18 +64,18 @@ def trained(
     for rows, columns in SIZES:
         mdp = cliff(rows, columns)
         found = work.call("train", mdp, algorithm, episodes, EPSILON, alpha, GAMMA, seed)
-        if not isinstance(found, list) or len(found) != 2 or np.shape(found[1]) != (episodes,):
+        if not isinstance(found, list) or len(found) != 2:
             raise WrongAnswerError("`train` must return q and a list with the return of each episode")
-        q = np.array(found[0], dtype=float)
-        if q.shape != mdp.next_state.shape[:2]:
-            raise WrongAnswerError(f"the q of `train` has the shape {q.shape}, must be (states, actions)")
-        strange = [each for each in found[1] if each > -columns - 1 or each % 1]
+        q = numbers("the q of `train`", found[0], mdp.next_state.shape[:2])
+        returns = numbers("the returns of `train`", found[1], (episodes,))
+        strange = [each for each in returns if each > -columns - 1 or each % 1]
         if strange:
             raise WrongAnswerError(
                 f"`train` has the return {strange[0]:.4g} at {mdp.name}, which no episode has; sum all its "
                 "rewards without a discount"
             )
-        if np.any(work.call("train", mdp, algorithm, 1, 1.0, 0.0, GAMMA, seed)[0]):
+        unmoved = work.call("train", mdp, algorithm, 1, 1.0, 0.0, GAMMA, seed)[0]
+        if numbers("the q of `train`", unmoved, q.shape).any():
             raise WrongAnswerError("`train` changes q with alpha = 0; q must begin with 0, and move by alpha")
         yield mdp.name, mdp, q
 
