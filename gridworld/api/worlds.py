@@ -11,7 +11,7 @@ from gymnasium.spaces import Discrete
 from numpy.typing import ArrayLike
 
 from gridworld.base.bounds import discount
-from gridworld.base.errors import InputError
+from gridworld.base.errors import InputError, on_a_line
 from gridworld.config.compose import named_world
 from gridworld.envs.inspection import Task, task_of, world_of
 from gridworld.envs.vector_env import GridWorldVectorEnv
@@ -107,14 +107,26 @@ def evaluate(
 
 
 def _by_states(task: Task, numbers: FloatArray) -> FloatArray:
-    """The rows of a table that may be by what is shown: two states may look alike, or be renumbered."""
+    """The rows of a table that is by what is shown: two states may look alike, or be renumbered."""
     mdp = task.mdp
     if not numbers.ndim:
         return numbers
-    if task.is_transformed and task.seen is not None:
+    if task.is_found and task.seen is not None:
         seen = task.seen()
-        if isinstance(seen.space, Discrete) and len(numbers) == seen.space.n:
-            return np.asarray(numbers[seen.table() - seen.space.start])
+        if not isinstance(seen.space, Discrete):
+            raise InputError(
+                f"the table: {mdp.name} shows {on_a_line(seen.space)}, by which no table has rows; give "
+                "a model, or "
+                "a table by the "
+                "states of compile_env(env)"
+            )
+        if len(numbers) != seen.space.n:
+            raise InputError(
+                f"the table: has {len(numbers)} rows; {mdp.name} shows {on_a_line(seen.space)}, so it "
+                "must have "
+                f"{seen.space.n}"
+            )
+        return np.asarray(numbers[seen.table() - seen.space.start])
     is_by_number = len(numbers) == mdp.num_numbers < mdp.num_states
     return np.asarray(numbers[mdp.number]) if is_by_number else numbers
 

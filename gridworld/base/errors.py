@@ -6,6 +6,7 @@ import errno
 import os
 import shlex
 from pathlib import Path
+from typing import Any
 
 EXIT_CODE = 2
 DISTRIBUTION = "gridworld-sb3"  # the package's name for pip; on PyPI another project has `gridworld`
@@ -34,6 +35,12 @@ def reason(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror + (f": {error.filename}" if error.filename else "")
     return f"{type(error).__name__}: {error}"
+
+
+def on_a_line(thing: Any) -> str:
+    """A thing as text on one line, shortened."""
+    text = " ".join(str(thing).split())
+    return text if len(text) <= 160 else f"{text[:157]}..."
 
 
 def in_short(error: BaseException) -> str:

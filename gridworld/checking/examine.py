@@ -6,7 +6,6 @@ import copy
 import re
 import textwrap
 import time
-import uuid
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -26,20 +25,16 @@ from gridworld.checking.sampling import Actions, Env, Replays, generators_restor
 from gridworld.checking.seen import ERROR, EnvFinding, Seen
 from gridworld.checking.symptoms import ALL
 from gridworld.config.compose import named_world
-from gridworld.envs.inspection import world_of
+from gridworld.envs.inspection import task_of
 from gridworld.envs.observations import make_observation
 from gridworld.envs.vector_env import GridWorldVectorEnv
-from gridworld.world.enumeration.snapshots import Snapshots
 from gridworld.world.mdp import Mdp
 from gridworld.world.metrics import wilson_interval
-from gridworld.world.sources.enumerated import enumerate_env
-from gridworld.world.sources.gymnasium_table import make_env
-from gridworld.world.wrappers import step_limit
+from gridworld.world.sources.environment import make_env, step_limit
 
 _STEPS = 20_000
 _MOST_STATES = 3_000  # to enumerate
 _SECONDS = 10.0  # for that
-_OF_CHANCE = 30  # how much longer a state takes whose steps draw
 _WIDTH = 100
 Make = Callable[[], Env]
 
@@ -116,7 +111,7 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
         started = time.monotonic()
         found = sample(make(), Actions(first.action_space, seed), steps, seed)
         rate, replayed = len(found.before) / max(time.monotonic() - started, 1e-3), Replays()
-        mdp = _exact(first, make, found.draws) if mdp is None else mdp
+        mdp = _exact(make) if mdp is None else mdp
         try:
             replayed = replays(make, Actions(first.action_space, seed), rate)
         except Exception as error:  # anybody's code
@@ -203,38 +198,12 @@ def _interface(make: Make) -> str:
     return ""
 
 
-def _exact(env: Env, make: Make, draws: bool) -> Mdp | None:
-    """The tables of an environment; None where it has none and cannot be enumerated."""
+def _exact(make: Make) -> Mdp | None:
+    """The tables of an environment; None where it has none and cannot be enumerated in the time for it."""
     try:
-        return world_of(env)
-    except InputError:
-        pass
-    name = f"gridworld-examined/E{uuid.uuid4().hex}-v0"
-    gym.register(name, lambda **_: make())
-    try:
-        return enumerate_env(name, most_states=_affordable(make(), _OF_CHANCE if draws else 1))
+        return task_of(make(), most_states=_MOST_STATES, most_seconds=_SECONDS).mdp
     except Exception:  # it cannot be enumerated, or its code fails
         return None
-    finally:
-        del gym.registry[name]
-
-
-def _affordable(env: Env, cost: int) -> int:
-    """How many states can be enumerated in the time for it."""
-    actions, snapshots, began, tries = (
-        Actions(env.action_space, 0),
-        Snapshots(env.unwrapped),
-        time.perf_counter(),
-        20,
-    )
-    for _ in range(tries):
-        env.reset(seed=0)
-        copy_ = snapshots.take()
-        snapshots.put_back(copy_)
-        snapshots.key()
-        env.step(actions.pool[0])
-    seconds = (time.perf_counter() - began) / tries * getattr(env.action_space, "n", 1) * cost
-    return int(np.clip(_SECONDS / seconds, 100, _MOST_STATES))
 
 
 def _facts(seen: Seen) -> Iterator[tuple[str, str]]:

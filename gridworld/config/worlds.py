@@ -100,12 +100,13 @@ class GymnasiumConfig(EnvConfig):
     def compiles_quickly(self) -> bool:
         if ":" in self.id or not super().compiles_quickly:
             return False
-        from gridworld.world.sources.gymnasium_table import has_table, make_env
+        from gridworld.world.sources.environment import make_env
+        from gridworld.world.sources.gymnasium_table import has_table
 
         return has_table(make_env(self.id, self.kwargs).unwrapped)
 
     def compile(self) -> Mdp:
-        from gridworld.world.sources.enumerated import compile_id
+        from gridworld.world.sources.environment import compile_id
 
         return compile_id(self.id, self.kwargs)
 
@@ -129,7 +130,7 @@ class EnumeratedConfig(GymnasiumConfig):
     ignore: list[Word] = field(default_factory=list)
 
     def compile(self) -> Mdp:
-        from gridworld.world.sources.enumerated import enumerate_env
+        from gridworld.world.sources.environment import enumerate_env
 
         return enumerate_env(self.id, self.kwargs, ignore=self.ignore)
 

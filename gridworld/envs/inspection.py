@@ -1,14 +1,16 @@
-"""The one door to a certificate: which task an environment or a batch is, and what an agent sees in it.
+"""Which task an environment or a batch is, and what an agent sees in it: is it ours, or does the door find
+it?
 
-What is scored has to be what was given: wrappers included, in every copy of a batch. What is not known
-exactly is refused. `gridworld.world.wrappers` says what the wrappers of an environment do; here are
-the environments below them and the batches above them, known by the names of their classes.
+What is scored has to be what was given: wrappers included, in every copy of a batch. A world here and a
+transition table are known; anything else is found by trying every action (`gridworld.world.door`). Here are
+the batches above environments, known by their classes.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from os import PathLike
 from types import MethodType
@@ -19,36 +21,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.base.bounds import MOST_STEPS, STEP_LIMIT, Bounds, positive_int
-from gridworld.base.errors import InputError
+from gridworld.base.errors import InputError, in_short
+from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.observations import KINDS, ObservationTable, TableObservation, make_observation
 from gridworld.envs.rendering import frame_size
-from gridworld.world.grid import GridMdp, compile_mdp
+from gridworld.world.door import known
+from gridworld.world.door.layers import layers_of
+from gridworld.world.door.search import traits
+from gridworld.world.door.world import Found
+from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import Layout, load
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import verified
-from gridworld.world.reach import same
-from gridworld.world.sources.gymnasium_table import compile_table, has_table
-from gridworld.world.wrappers import NEUTRAL, STEPPED_BY, Wrapped, known_class, step_limit, wrappers_of
+from gridworld.world.sources.environment import found_by, found_of, shortcut, step_limit
 
 # What a batch is, by the class whose methods it runs.
 _GYMNASIUM, _SB3 = "gymnasium.wrappers.vector", "stable_baselines3.common.vec_env"
-_NATIVE, _COPIES, _PROCESSES, _TABLE, _OURS = "native", "copies", "other processes", "table", "native of SB3"
+_NEUTRAL, _NATIVE, _COPIES, _PROCESSES, _TABLE, _OURS = (
+    "neutral",
+    "native",
+    "copies",
+    "other processes",
+    "table",
+    "native of SB3",
+)
 _BATCHES = {
     "gridworld.envs.vector_env:GridWorldVectorEnv": _NATIVE,
     "gridworld.envs.statistics_env:StatisticsVectorEnv": _NATIVE,
     "gridworld.envs.observations:VectorTableObservation": _TABLE,
     "gymnasium.vector.sync_vector_env:SyncVectorEnv": _COPIES,
     "gymnasium.vector.async_vector_env:AsyncVectorEnv": _PROCESSES,
-    f"{_GYMNASIUM}.common:RecordEpisodeStatistics": NEUTRAL,
-    f"{_GYMNASIUM}.dict_info_to_list:DictInfoToList": NEUTRAL,
-    f"{_GYMNASIUM}.rendering:HumanRendering": NEUTRAL,
-    f"{_GYMNASIUM}.rendering:RecordVideo": NEUTRAL,
+    f"{_GYMNASIUM}.common:RecordEpisodeStatistics": _NEUTRAL,
+    f"{_GYMNASIUM}.dict_info_to_list:DictInfoToList": _NEUTRAL,
+    f"{_GYMNASIUM}.rendering:HumanRendering": _NEUTRAL,
+    f"{_GYMNASIUM}.rendering:RecordVideo": _NEUTRAL,
     "gridworld.agents.sb3.vec_env:GridWorldVecEnv": _OURS,
     f"{_SB3}.dummy_vec_env:DummyVecEnv": _COPIES,
     f"{_SB3}.subproc_vec_env:SubprocVecEnv": _PROCESSES,
-    f"{_SB3}.vec_check_nan:VecCheckNan": NEUTRAL,
-    f"{_SB3}.vec_monitor:VecMonitor": NEUTRAL,
-    f"{_SB3}.vec_video_recorder:VecVideoRecorder": NEUTRAL,
+    f"{_SB3}.vec_check_nan:VecCheckNan": _NEUTRAL,
+    f"{_SB3}.vec_monitor:VecMonitor": _NEUTRAL,
+    f"{_SB3}.vec_video_recorder:VecVideoRecorder": _NEUTRAL,
     f"{_SB3}.vec_extract_dict_obs:VecExtractDictObs": "extract",
     f"{_SB3}.vec_normalize:VecNormalize": "normalize",
     f"{_SB3}.vec_transpose:VecTransposeImage": "transpose",
@@ -67,27 +79,28 @@ _BY_METHOD: dict[str, Callable[[Any, Any], Any]] = {  # what SB3's wrappers make
 class Task:
     """What somebody trains on, or asks a score for."""
 
-    mdp: Mdp  # the world, with what wrappers make of rewards and actions
+    mdp: Mdp  # the world, wrappers included
     own_limit: int | None = None  # the environment's own step limit, if any
     max_episode_steps: int = STEP_LIMIT
-    is_transformed: bool = False  # by wrappers, so that a Discrete observation may be another number
+    is_found: bool = False  # by search, so that a table's rows are by what is shown
     seen: Callable[[], ObservationTable] | None = None  # as it is now; None: a world alone was given
     # allowed actions (S, A), if anything is said
     masks: Callable[[], NDArray[np.bool_] | None] = lambda: None
 
 
-def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
+def task_of(env: Any, max_episode_steps: int | None = None, **bounds: Any) -> Task:
     """Find out which task an environment is; refuses what has no world in it or may change it unseen.
 
-    `env` is an environment or a batch of Gymnasium or SB3, wrapped or not, of a GridWorld or with a
-    transition table; a compiled world; or a map. Without a limit it is the environment's own, or else 100.
+    `env` is an environment or a batch of Gymnasium or SB3, wrapped or not; a class or a function that makes
+    one; a compiled world; or a map. Without a limit it is the environment's own, or else 100. `bounds`: see
+    `enumerated`.
     """
     if isinstance(env, Mdp):
         task = Task(env, env.max_episode_steps)
     elif isinstance(env, PathLike | Layout):
         task = Task(compile_mdp(load(env)))
     else:
-        task = _task(env)
+        task = _task(env, **bounds)
     limit = task.own_limit if max_episode_steps is None else max_episode_steps
     limit = STEP_LIMIT if limit is None else positive_int("max_episode_steps", limit)
     Bounds(high=MOST_STEPS).check("max_episode_steps", limit)
@@ -101,80 +114,92 @@ def world_of(env: Any) -> Mdp:
     return mdp if limit in (None, mdp.default_step_limit) else replace(mdp, max_episode_steps=limit)
 
 
-def _task(env: Any) -> Task:
+def _task(env: Any, **bounds: Any) -> Task:
     if isinstance(env, gym.Env):
-        return _single(env)
+        return _single(env, **bounds)
     if isinstance(env, gym.vector.VectorEnv) or hasattr(env, "step_wait"):
         return _batch(env)
-    raise _no_world(env)
-
-
-def _no_world(env: Any) -> InputError:
-    return InputError(
-        f"env: {type(env).__name__} contains neither a GridWorld nor a transition table; must be a "
-        "GridWorld environment, a Gymnasium one with a table P, a compiled world, or a world's name; another "
-        "environment of Gymnasium is enumerated if its id is given, e.g. compile_env('my_module:My-v0')"
+    if callable(env):
+        return _made(env, **bounds)
+    raise InputError(
+        f"env: {type(env).__name__} is no environment; must be an environment or a batch of Gymnasium or "
+        "SB3, a class "
+        "or a function that makes one, a compiled world, or a world's name"
     )
 
 
-def _single(env: gym.Env[Any, Any]) -> Task:
-    real, limit = env.unwrapped, step_limit(env)
-    innermost = [env, *(wrapper.env for wrapper in wrappers_of(env))][-1]
-    mdp = getattr(real, "mdp", None)
-    if real is not innermost or not isinstance(real, gym.Env):
-        raise InputError(
-            f"env: {type(innermost).__name__} replaces {type(real).__name__} and may change its steps, so "
-            "it cannot be solved exactly; make it a gymnasium.Wrapper"
-        )
-    if isinstance(mdp, GridMdp):
-        methods = (*STEPPED_BY, "mdp", "np_random")
-        if known_class(real, {"gridworld.envs.env:GridWorldEnv": _NATIVE}, methods) is None:
-            raise InputError(
-                f"env: {type(real).__name__} has its own step() or reset(), so its task may differ from its "
-                "map; leave them as in GridWorldEnv, or wrap it"
-            )
-        verified(mdp, "env")
-    elif has_table(real):
-        mdp = compile_table(real, limit)
-    else:
-        raise _no_world(real)
-    wrapped = Wrapped("env", env, mdp)
-    is_number = isinstance(env.observation_space, gym.spaces.Discrete)  # maybe of an earlier state
+def _made(make: Any, **bounds: Any) -> Task:
+    """The task of what a class or a function makes."""
+
+    def made() -> gym.Env[Any, Any]:
+        try:
+            env = make()
+        except Exception as error:  # it may raise anything
+            name = getattr(make, "__name__", type(make).__name__)
+            raise InputError(f"env: {name}() cannot make an environment ({in_short(error)})") from error
+        if not isinstance(env, gym.Env):
+            raise InputError(f"env: it makes a {type(env).__name__}; must be a gymnasium.Env")
+        return env
+
+    with closing(made()) as env:
+        return _known(env) or _task_of_found(found_by(made, **bounds))
+
+
+def _single(env: gym.Env[Any, Any], **bounds: Any) -> Task:
+    return _known(env) or _task_of_found(found_of(env, **bounds))
+
+
+def _known(env: gym.Env[Any, Any]) -> Task | None:
+    """The task of an environment of ours, or of one with a table that its steps follow."""
+    if (task := _ours(env)) is not None:
+        return task
+    if (mdp := shortcut(env)) is not None:
+        return Task(mdp, step_limit(env), seen=lambda: make_observation(mdp, "none"))
+    return None
+
+
+def _task_of_found(found: Found) -> Task:
     return Task(
-        mdp=wrapped.mdp,
-        own_limit=limit,
-        is_transformed=bool(wrapped.transforms or (wrapped.memory and is_number)),
-        seen=functools.cache(lambda: _seen(env, wrapped, mdp)),
-        masks=lambda: wrapped.action_masks,
+        found.mdp,
+        found.mdp.max_episode_steps,
+        is_found=True,
+        seen=functools.cache(lambda: tabulated(found.space, found.rows, found.mdp.num_states)),
+        masks=lambda: found.masks,
     )
 
 
-def _seen(env: gym.Env[Any, Any], wrapped: Wrapped, mdp: Mdp) -> ObservationTable:
-    if not wrapped.transforms and not wrapped.memory:
-        return make_observation(mdp, "none")
-    only = wrapped.transforms[0] if len(wrapped.transforms) == 1 and not wrapped.memory else None
-    own = getattr(only, "observation", None)
-    if isinstance(only, TableObservation) and own == MethodType(TableObservation.observation, only):
-        return only.table
-    space = env.observation_space
-    return tabulated(space, _stacked(wrapped.observations, space), mdp.num_states)
+def _ours(env: gym.Env[Any, Any]) -> Task | None:
+    """The task of a GridWorld that steps as ours does, with no wrapper but of our observations."""
+    *outer, real = layers_of(env)
+    methods = ("step", "reset", "mdp", "np_random", "unwrapped")
+    if known_class(real, {"gridworld.envs.env:GridWorldEnv": _NATIVE}, methods) is None:
+        return None
+    shown = [each for each in outer if not (known.is_neutral(each) or known.is_limit(each))]
+    is_table = len(shown) == 1 and known.steps_once(shown[0]) and isinstance(shown[0], TableObservation)
+    if (shown and not (is_table and _is_inherited(shown[0]))) or hasattr(real, "action_masks"):
+        return None
+    assert isinstance(real, GridWorldEnv)
+    verified(real.mdp, "env")
+    table = shown[0].table if shown else make_observation(real.mdp, "none")
+    return Task(real.mdp, step_limit(env), seen=lambda: table)
 
 
-def _stacked(observations: list[Any], space: gym.Space[Any]) -> Any:
-    """All observations in one array, of the space's type as batches have them."""
-    if isinstance(space, gym.spaces.Dict):
-        return {key: _stacked([each[key] for each in observations], inner) for key, inner in space.items()}
-    try:
-        given = np.stack([np.asarray(each) for each in observations])
-        rows = given.astype(space.dtype)
-    except (TypeError, ValueError):
-        raise InputError(f"env: its observations are not arrays of its space, {space}") from None
-    if not np.allclose(rows.astype(np.float64), given.astype(np.float64), rtol=1e-3, atol=1e-6):
-        raise InputError(
-            f"env: its observations are {given.dtype}, but its space says {space.dtype}, and a batch "
-            "converts them; correct the dtype of the space"
-        )
-    return rows
+def _is_inherited(wrapper: Any) -> bool:
+    own = getattr(wrapper, "observation", None)
+    return own == MethodType(TableObservation.observation, wrapper) and "reset" not in vars(wrapper)
+
+
+def known_class(thing: Any, table: dict[str, str], methods: Sequence[str]) -> str | None:
+    """What a table by "module:class" says of the first known ancestor of an object, whose `methods` it runs.
+
+    None if there is none, or a method is its own.
+    """
+    kind, held = type(thing), getattr(thing, "__dict__", {}).keys() - {"env"}
+    for base in kind.__mro__:
+        if entry := table.get(f"{base.__module__}:{base.__qualname__}"):
+            inherited = all(getattr(kind, name, None) is getattr(base, name, None) for name in methods)
+            return entry if inherited and not any(name in held for name in methods) else None
+    return None
 
 
 def _copies(batch: Any) -> Task:
@@ -185,7 +210,11 @@ def _copies(batch: Any) -> Task:
             f"env: the {type(batch).__name__} contains the same environment twice; make a new one for each"
         )
     task = _single(first)
-    tasks = {index: _single(other) for index, other in enumerate(others, 1)}
+    same = traits(first) if others and task.is_found else None
+    tasks = {
+        index: task if task.is_found and traits(other) == same else _single(other)
+        for index, other in enumerate(others, 1)
+    }
 
     def refuse_others(is_same: Callable[[Task], bool], mistake: str) -> None:
         for index, other in tasks.items():
@@ -200,7 +229,7 @@ def _copies(batch: Any) -> Task:
 
         def shows_the_same(other: Task) -> bool:
             theirs = other.seen()  # type: ignore[misc]
-            return table.space == theirs.space and same(_rows(table), _rows(theirs))
+            return table.space == theirs.space and equal(_rows(table), _rows(theirs))
 
         refuse_others(shows_the_same, "shows states differently from")
         return table
@@ -243,7 +272,7 @@ def _batch(env: Any) -> Task:
     if kind == _OURS:
         return replace(_batch(env.envs), seen=lambda: env.observation)
     below = _batch(env.env if isinstance(env, gym.vector.VectorWrapper) else env.venv)
-    if kind == NEUTRAL:
+    if kind == _NEUTRAL:
         return below
     if kind == _TABLE:
         return replace(below, seen=lambda: env.table)
@@ -259,6 +288,13 @@ def _batch(env: Any) -> Task:
         return tabulated(env.observation_space, rows, below.mdp.num_states)
 
     return replace(below, seen=seen)
+
+
+def equal(one: Any, other: Any) -> bool:
+    """Whether two tables of observations are the same, to the bit."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)
+    return bool(np.array_equal(one, other)) and np.asarray(one).dtype == np.asarray(other).dtype
 
 
 def tabulated(space: gym.Space[Any], rows: Any, num_states: int) -> ObservationTable:

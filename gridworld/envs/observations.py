@@ -47,10 +47,14 @@ class ObservationTable:
     kind: str
     space: gym.Space[Any]
     num_states: int
-    stored: NDArray[Any] | None  # (S, *shape), read-only; None: one-hot rows, written when they are asked for
+    # (S, *shape), read-only, or such by the keys of a Dict; None: one-hot rows, written when they are asked
+    # for
+    stored: Any
 
     def rows(self, states: IntArray, out: NDArray[Any] | None = None) -> NDArray[Any]:
         """Look up the observations (..., *shape) of states (...), in `out` or a fresh array."""
+        if isinstance(self.stored, dict):
+            return {key: table[states] for key, table in self.stored.items()}  # type: ignore[return-value]
         if self.stored is not None:
             # States are within the table; "clip" merely spares numpy a buffered copy.
             return np.take(self.stored, states, axis=0, out=out, mode="clip" if out is not None else "raise")

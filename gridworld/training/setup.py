@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable
@@ -15,7 +14,6 @@ from gridworld.config.train import AUTO, PICTURES, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.world.enumeration.memoryless import aliased, cost_of_own_observation
 from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
 
@@ -106,28 +104,8 @@ def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
         found.append(f"{why}: preset={config.preset}, {steps}; preset=none {otherwise}")
     if config.known_failure is not None:
         found.append(f"agent={config.agent.name} is known to fail: {config.known_failure}")
-    return [*found, *filter(None, [objective_note(config, mdp), memory_note(config, mdp)])]
-
-
-def memory_note(config: TrainConfig, mdp: Mdp) -> str | None:
-    """Say what it costs to see only the own observation of a random world, if that has several states."""
-    has_chance = mdp.is_stochastic or len(mdp.start_states) > 1
-    count = len(aliased(mdp)) if config.observation.kind == "own" and has_chance else 0
-    if not count:
-        return None
-    cost = None
-    if mdp.probability.size <= _QUICKLY_SOLVED:
-        with contextlib.suppress(InputError):  # no finite optimum
-            cost = cost_of_own_observation(mdp, config.evaluation.gamma)
-            judge = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
-    if cost is None:
-        loses = "is at best as good as the optimum, which is with memory"
-    elif cost <= judge.tolerance:
-        loses = "can be optimal all the same"
-    else:
-        loses = f"has a regret of at least {cost:.4g}, if it is deterministic"
-    several = f"{count:,} observations stand for several states"
-    return f"observation=own: {several}; a policy that sees no more {loses}"
+    note = objective_note(config, mdp)
+    return found if note is None else [*found, note]
 
 
 def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:

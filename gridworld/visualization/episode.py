@@ -26,7 +26,8 @@ from gridworld.visualization.animation import (
 )
 from gridworld.visualization.picture import Draw, Subject
 from gridworld.world.mdp import Mdp
-from gridworld.world.sources.gymnasium_table import has_table, make_env
+from gridworld.world.sources.environment import make_env
+from gridworld.world.sources.gymnasium_table import has_table
 
 _MOST_FRAMES = 500  # of an episode that finds no end; by then a greedy one goes round in circles
 _MOST_PIXELS = 512 * 512  # of a frame that another environment renders

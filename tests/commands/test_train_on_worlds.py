@@ -10,7 +10,7 @@ from helpers.support import script
 from PIL import Image
 
 from gridworld.training.saved_run import SavedRun
-from gridworld.world.sources.gymnasium_table import compile_gymnasium
+from gridworld.world.sources.environment import compile_id
 
 TRAINED = (
     *("agent=q_learning", "env=frozen_lake_v1", "env.kwargs.is_slippery=false"),
@@ -36,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_keeps_its_world(folder: Path) -> None:
     saved = SavedRun(folder / "short")
-    made = compile_gymnasium("FrozenLake-v1", {"is_slippery": False})
+    made = compile_id("FrozenLake-v1", {"is_slippery": False})
     assert saved.mdp.text() == made.text()
     assert saved.mdp.max_episode_steps == 100
     for name in ("next_state", "probability", "reward", "terminal", "goal", "start", "thresholds", "places"):

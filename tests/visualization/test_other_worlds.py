@@ -44,7 +44,7 @@ from gridworld.world.layout import load
 from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.solver import value_iteration
-from gridworld.world.sources.enumerated import enumerate_env
+from gridworld.world.sources.environment import enumerate_env
 
 DIRECTIONS = {"up": (-1, 0), "right": (0, 1), "down": (1, 0), "left": (0, -1)}
 DIRECTIONS |= {"north": (-1, 0), "east": (0, 1), "south": (1, 0), "west": (0, -1)}

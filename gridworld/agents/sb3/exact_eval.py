@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
@@ -27,19 +28,17 @@ from gridworld.agents.sb3.policy_outputs import (
 )
 from gridworld.base.atomic_write import replacing
 from gridworld.base.bounds import Bounds, discount
-from gridworld.base.errors import InputError, in_short
+from gridworld.base.errors import InputError, in_short, on_a_line
 from gridworld.config.compose import named_world
-from gridworld.envs.inspection import Task, observation_like, tabulated, task_of
+from gridworld.envs.inspection import Task, equal, observation_like, tabulated, task_of
 from gridworld.envs.observations import KINDS, ObservationTable
 from gridworld.run.folder import BEST_MODEL, EVALUATIONS
 from gridworld.run.writer import write_evaluations
 from gridworld.world.chain import one_hot_policy
-from gridworld.world.enumeration.snapshots import random_states
+from gridworld.world.door.layers import random_states
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray, IntArray
 from gridworld.world.metrics import numbers
-from gridworld.world.reach import same
-from gridworld.world.wrappers import is_discrete
 
 _LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.", "torch.")
 _ONE_BY_ONE = 512  # states in which `predict` is asked alone, too
@@ -70,7 +69,7 @@ class ForeignPolicy:
             raise InputError(f"{type(model).__name__}: is neither a model of Stable-Baselines3 nor a table")
         self._model, self._task, self._policy = model, task, policy
         self._guess_is_fine = False
-        if not is_discrete(policy.action_space, task.mdp.num_actions):
+        if policy.action_space != spaces.Discrete(task.mdp.num_actions):
             raise InputError(
                 f"the model acts in {policy.action_space}; "
                 f"{task.mdp.name} has Discrete({task.mdp.num_actions})"
@@ -103,12 +102,11 @@ class ForeignPolicy:
         if seen is not None and seen.space != wanted and _is_transposed(seen.space, wanted):
             return tabulated(wanted, seen.table().transpose(0, 3, 1, 2), seen.num_states)
         if seen is not None and seen.space == wanted:
-            if isinstance(seen.stored, dict):
-                raise InputError("env: observes a Dict; take one entry, as VecExtractDictObs does")
             return seen
         if seen is not None and seen.kind not in KINDS:
             raise InputError(
-                f"the model expects {wanted}, but the environment shows {seen.space}; give the environment "
+                f"the model expects {on_a_line(wanted)}, but the environment shows "
+                f"{on_a_line(seen.space)}; give the environment "
                 "that it was trained on, model.get_env()"
             )
         guess = observation_like(self._task.mdp, wanted)
@@ -128,7 +126,7 @@ class ForeignPolicy:
                 f"the model: its training observations are unknown ({error}); give an environment that "
                 "shows the same ones"
             ) from None
-        alike = shown is not None and shown.space == guess.space and same(shown.table(), guess.table())
+        alike = shown is not None and shown.space == guess.space and equal(shown.table(), guess.table())
         if not alike and (shown is None or shown.kind not in KINDS):
             raise InputError(
                 f"the model was trained on custom observations, and {guess.kind} of this world merely has "

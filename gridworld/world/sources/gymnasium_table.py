@@ -6,15 +6,12 @@ Environments of Gymnasium's `toy_text` family have a table `P` and a start distr
     initial_state_distrib = (N,) probabilities
 
 Ending belongs to the outcome there; `gridworld.world.outcomes` makes it a state. An environment whose steps
-are not those of its table is refused: the real one is walked beside the table (`table_walk`), each step must
-be an outcome of its row, and as likely as the row says: exactly where all draws can be tried, and else as
-far as frequencies tell.
+are not those of its table is refused: in each state every outcome of each action is tried (`table_rows`).
 """
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -22,49 +19,41 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.base.errors import InputError, in_short, install_command
+from gridworld.base.errors import InputError
 from gridworld.world.mdp import Mdp, grid_places
 from gridworld.world.outcomes import Outcomes, check_size, mdp_from_outcomes
-from gridworld.world.sources.table_walk import walk
-from gridworld.world.wrappers import copied, refuse_transformed, step_limit
+from gridworld.world.sources.table_rows import compare_rows
 
-# What was found of Gymnasium's own classes by their tables, which are walked once in a process.
-_WALKED: dict[Any, str] = {}
-
-
-def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Mdp:
-    """Make an environment of Gymnasium and compile its transition table.
-
-    `kwargs` are arguments of `gymnasium.make`. The world has the id as its name, and its step limit.
-    """
-    env, again = make_env(env_id, kwargs), make_env(env_id, kwargs)
-    refuse_transformed(env_id, env)
-    if _differ(_table(env_id, env.unwrapped), _table(env_id, again.unwrapped)):
-        raise InputError(
-            f"env.id={env_id}: has a different table each time it is made, so it cannot be solved exactly; "
-            "fix it by env.kwargs, e.g. desc of a FrozenLake"
-        )
-    mdp = compile_table(again.unwrapped, step_limit(env), env_id)
-    env.close()
-    again.close()
-    return mdp
+FOLLOWED = "table P, which its steps follow exactly"  # the `truth` of such worlds
+# Gymnasium's own classes and tables whose rows were stepped, once in a process.
+_COMPARED: set[Any] = set()
 
 
-def compile_table(real: gym.Env[Any, Any], limit: int | None = None, name: str | None = None) -> Mdp:
-    """Compile the table of an environment without wrappers, which is left as it is; a copy is stepped.
+def compile_table(real: gym.Env[Any, Any], limit: int | None = None, name: str | None = None) -> Mdp | None:
+    """Compile the table of an environment without wrappers, which is left as it is; its rows are stepped.
 
-    `limit` is the step limit of its wrappers. Without a name the world is called by its id or class.
+    `limit` is the step limit of its wrappers. Without a name the world is called by its id or class. None:
+    its state cannot be set, so that its rows cannot be stepped.
     """
     called = name or (real.spec.id if real.spec is not None else type(real).__name__)
     mdp, table = _compiled(real, called, limit)
-    if own := {"step", "reset"} & vars(real).keys():
-        raise InputError(f"{called}: its {own.pop()}() was replaced, so it cannot be solved exactly")
-    is_gymnasiums = type(real).__module__.startswith("gymnasium.envs.")
-    key = (type(real).step, type(real).reset, mdp.text()) if is_gymnasiums and name is None else None
-    truth = _WALKED.get(key) or _check_steps(mdp, table, copied(real))
-    if key is not None:
-        _WALKED[key] = truth
-    return replace(mdp, truth=truth)
+    own = {"step", "reset"} & vars(real).keys()
+    is_gymnasiums = type(real).__module__.startswith("gymnasium.envs.") and not own
+    settings = sorted((key, each) for key, each in vars(real).items() if isinstance(each, bool | float | str))
+    key = (type(real).step, type(real).reset, repr(settings), mdp.text()) if is_gymnasiums else None
+    if key not in _COMPARED:
+        compared = compare_rows(mdp, table, real)
+        if _differ(table, _table(called, real)):
+            raise InputError(
+                f"{called}: its table P changes when it is reset or stepped, so it cannot be solved "
+                "exactly; it must "
+                "not change"
+            )
+        if not compared:
+            return None
+        if key is not None:
+            _COMPARED.add(key)
+    return replace(mdp, truth=FOLLOWED)
 
 
 def has_table(env: Any) -> bool:
@@ -155,25 +144,6 @@ def _differ(table: Outcomes, other: Outcomes) -> bool:
     return not all(np.array_equal(one, two, equal_nan=True) for one, two in tables)
 
 
-def _check_steps(mdp: Mdp, table: Outcomes, env: gym.Env[Any, Any]) -> str:
-    """What `walk` says."""
-    real, mistake, found = env.unwrapped, None, ""
-    try:
-        found = walk(mdp, table, env)
-    except InputError as error:
-        mistake = error
-    except Exception as error:  # an environment of the user's own may raise anything
-        raise InputError(f"{mdp.name}: cannot be stepped ({short_reason(error)})") from error
-    if _differ(table, _table(mdp.name, real)):
-        raise InputError(
-            f"{mdp.name}: its table P changes when it is reset or stepped, so it cannot be solved exactly; "
-            "it must not change"
-        )
-    if mistake is not None:
-        raise mistake
-    return found
-
-
 class _KnownEnv(NamedTuple):
     """What is known of a class of environments beside its table; see `Mdp`."""
 
@@ -205,51 +175,3 @@ def known_env(real: Any) -> _KnownEnv | None:
         if each.__module__.startswith("gymnasium.envs.toy_text."):
             return _KNOWN.get(each.__name__)
     return None
-
-
-def make_env(
-    env_id: str, kwargs: Mapping[str, Any] | None = None, render_mode: str | None = None
-) -> gym.Env[Any, Any]:
-    """Make an environment by its registered id; "module:id" imports the module first."""
-    arguments = dict(kwargs or {})
-    if arguments.get("render_mode") is not None:
-        raise InputError(
-            f"env.kwargs: render_mode={arguments['render_mode']} is not part of the world; leave it out"
-        )
-    module, _, registered = str(env_id).rpartition(":")
-    if module:
-        try:
-            importlib.import_module(module)
-        except (Exception, SystemExit) as error:  # it may raise anything
-            reason = f"the module {module} cannot be imported ({short_reason(error)})"
-            missing = error.name if isinstance(error, ModuleNotFoundError) else None
-            if missing and f"{module}.".startswith(f"{missing}."):
-                reason = f"no module {missing}; install it, or add its folder to PYTHONPATH"
-            raise InputError(f"env.id={str(env_id)[:80]}: {reason}") from None
-    if registered.startswith(("MiniGrid-", "BabyAI-")):
-        try:
-            importlib.import_module("minigrid")  # registers them
-        except ImportError:
-            needed = f"needs the package minigrid; install it with {install_command('minigrid')}"
-            raise InputError(f"env.id={env_id}: {needed}") from None
-    try:
-        spec = gym.spec(registered)
-    except Exception as error:  # an id may name a module, which may raise anything
-        raise InputError(
-            f"env.id={str(env_id)[:80]}: is not registered with Gymnasium ({short_reason(error)}); give a "
-            "registered id, e.g. FrozenLake-v1"
-        ) from None
-    if render_mode is not None or "render_mode" in spec.kwargs:  # which not every class takes
-        arguments["render_mode"] = render_mode
-    try:
-        with np.errstate(all="ignore"):
-            return gym.make(env_id, **{"disable_env_checker": True, **arguments})
-    except Exception as error:  # as above
-        shown = ", ".join(f"{key}: {value}" for key, value in arguments.items())[:100]
-        given = f"env.kwargs={{{shown}}}: {env_id}" if arguments else f"env.id={env_id}:"
-        raise InputError(f"{given} cannot be made ({short_reason(error)})") from None
-
-
-def short_reason(error: BaseException) -> str:
-    """What an exception says, in short."""
-    return in_short(error).split(" was raised from the environment creator")[0].rstrip(" .")

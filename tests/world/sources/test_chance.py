@@ -2,7 +2,6 @@
 
 import itertools
 import threading
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -11,19 +10,14 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.envs.toy_text import blackjack
-from helpers.support import configure
 
 from gridworld.base.errors import InputError
 from gridworld.config.worlds import GymnasiumConfig
-from gridworld.training.setup import notes
-from gridworld.world.enumeration import beliefs
-from gridworld.world.enumeration.memoryless import cost_of_own_observation
-from gridworld.world.enumeration.snapshots import Snapshots
+from gridworld.world.door import beliefs, known
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
-from gridworld.world.sources.enumerated import enumerate_env
-from gridworld.world.sources.gymnasium_table import compile_gymnasium
+from gridworld.world.sources.environment import compile_id, enumerate_env
 
 GAMMA = 0.9
 
@@ -190,9 +184,7 @@ def same_world(one: Mdp, other: Mdp) -> None:
 )
 def test_custom_environments_are_their_tables(compiled: Any, kind: Any, rows: Any, start: Any) -> None:
     mdp = compiled(kind)
-    assert (
-        mdp.truth == f"enumerated, {mdp.num_states - int(mdp.terminal.sum())} states" or kind is not Inventory
-    )
+    assert mdp.truth == "enumerated, 5 states" or kind is not Inventory
     assert "stand for several" not in mdp.truth
     same_world(mdp, by_hand(rows(), kind, start))
     assert mdp.state_name(int(mdp.start_states[0])).startswith("observation ")
@@ -206,7 +198,7 @@ def test_gymnasiums_environments_are_their_tables(env_id: str, kwargs: dict[str,
     mdp = enumerate_env(
         env_id, kwargs, ignore=["P", "lastaction"]
     )  # which the steps do not change, or not read
-    same_world(mdp, compile_gymnasium(env_id, kwargs))
+    same_world(mdp, compile_id(env_id, kwargs))
     assert mdp.action_names == ("0", "1", "2", "3")
 
 
@@ -268,43 +260,9 @@ def test_blackjack_with_few_cards_is_as_good_as_by_its_rules(
     assert mdp.own_observation.shape == (mdp.num_states, 3)
 
 
-@pytest.mark.parametrize("more", [{}, {"nested": [[1], (2, [3.0])]}], ids=["by marshal", "by pickle"])
-def test_a_copy_is_put_back_as_it_was(more: dict[str, Any]) -> None:
-    env, shared = World(), [4, 5]
-    plain = {"whole": 1, "yes": True, "one": 1.0, "minus": -0.0, "text": "é", "none": None, "pair": (1, 1.0)}
-    numpys = {"n": np.int64(3), "b": np.bool_(1), "m": np.float32(-0.0), "s": np.str_("ab"), "u": np.uint8(3)}
-    lists = {"cards": [1, True, "x"], "one_of_two": shared} | ({"other": shared} if more else {})
-    vars(env).update(plain | numpys | lists | more)
-    snapshots, before = Snapshots(env), dict(vars(env))
-    snapshots.take()  # what is kept as it is, such as a space, is known from here on
-    copy = snapshots.take()
-    assert copy.startswith(b"[") != bool(more)
-    env.cards.append(7)
-    env.n, env.new = np.int64(8), 1
-    snapshots.put_back(copy)
-    found = vars(env)
-    env.cards.append(8)  # a copy is not changed by what happens to what was made of it
-    snapshots.put_back(copy)
-    before["cards"] = [1, True, "x"]
-    assert [*found] == [*before]
-    assert {name: (type(each), repr(each)) for name, each in found.items()} == {
-        name: (type(each), repr(each)) for name, each in before.items()
-    }
-    assert found["action_space"] is before["action_space"]
-    assert not more or found["one_of_two"] is found["other"]
-    env.other = env.one_of_two  # two names of one list are not two lists
-    assert not snapshots.take().startswith(b"[")
-
-
-def test_hands_are_summed_up_only_as_the_known_source_reads_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = blackjack.BlackjackEnv()
-    assert Snapshots(env)._read_by is not None
-    assert Snapshots(type("Own", (blackjack.BlackjackEnv,), {})())._read_by is None
-    env.rounds = 3
-    assert Snapshots(env)._read_by is None
-    del env.rounds
-    monkeypatch.setattr(blackjack, "score", lambda hand: len(hand))
-    assert Snapshots(env)._read_by is None
+def test_hands_are_summed_up_only_for_the_known_class() -> None:
+    assert known.state_reader(blackjack.BlackjackEnv()) is not None
+    assert known.state_reader(type("BlackjackEnv", (blackjack.BlackjackEnv,), {})()) is None
 
 
 @pytest.mark.slow
@@ -350,7 +308,9 @@ def test_an_optimum_that_nobody_can_reach_is_not_claimed(compiled: Any) -> None:
 def test_beliefs_without_end_are_refused(compiled: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(beliefs, "_MOST_BITS", 256)
     faint = type("Faint", (Hidden,), {"clear": 0.75})  # evidence adds up for as long as one looks
-    with pytest.raises(InputError, match=r"has no end: after [\d,]+ different distributions"):
+    with pytest.raises(
+        InputError, match=r"has no end in the time or size allowed: after [\d,]+ different distributions"
+    ):
         compiled(faint)
 
 
@@ -377,10 +337,6 @@ def test_an_observation_of_several_beliefs_is_said(compiled: Any) -> None:
     by_observation = np.eye(2)[np.where(mdp.own_observation == 2, 1, 0)]
     score = judge.score(by_observation)
     assert (score.value, score.certified) == (0.5, False)
-    assert cost_of_own_observation(mdp, 1.0) == 0.5
-    config = configure("env=enumerated", "env.id=Delayed-v0", "agent=dqn", "observation=own")
-    note = "1 observations stand for several states; a policy that sees no more has a regret of at least 0.49"
-    assert any(note in each for each in notes(config, mdp))
 
 
 class Coin(World):
@@ -395,7 +351,7 @@ class Coin(World):
 
 def test_random_rewards_and_observations(compiled: Any) -> None:
     mdp = compiled(Coin)
-    assert mdp.num_states == 3
+    assert mdp.reachable.sum() == 3
     assert Evaluator(mdp, GAMMA, 50).optimal_value == pytest.approx(2 / (1 - GAMMA))
 
 
@@ -489,10 +445,6 @@ UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
         {"move": lambda s, a: (0, s.np_random.random(), False)},
         r"used for more than comparisons .*test_chance.py:\d+",
     ),
-    "a state that is a draw": (
-        {"move": lambda s, a: (s.np_random.random(), 0.0, False), "show": lambda s: 0},
-        r"used for more than comparisons .*test_chance.py:\d+",
-    ),
     "an observation that is a draw": (
         {"move": lambda s, a: (0, 0.0, False), "show": lambda s: s.np_random.random()},
         r"used for more than comparisons .*test_chance.py:\d+",
@@ -505,39 +457,17 @@ UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
         {"move": lambda s, a: (s.np_random.bit_generator.state["has_uint32"], 0.0, False)},
         "bit_generator is used",
     ),
-    "another generator": (
-        {
-            "made": lambda s: setattr(s, "rng", np.random.Generator(np.random.PCG64(3))),
-            "move": lambda s, a: (int(s.rng.integers(2)), 0.0, False),
-        },
-        "another generator than",
-    ),
     "another generator in reset": (
         {"begin": lambda s: int(np.random.default_rng().integers(2)), "move": lambda s, a: (0, 0.0, False)},
-        "numpy.random.default_rng",
+        "does not repeat a walk",
     ),
     "a global generator in reset": (
         {"begin": lambda s: int(np.random.rand() < 0.5), "move": lambda s, a: (0, 0.0, False)},
         "another generator than",
     ),
-    "a clock in reset": (
-        {"begin": lambda s: int(time.time()) % 2, "move": lambda s, a: (0, 0.0, False)},
-        "time.time",
-    ),
     "a generator in a closure": (
         {"made": lambda s: setattr(s, "draw", _closure()), "move": lambda s, a: (int(s.draw()), 0.0, False)},
-        "another generator than",
-    ),
-    "a bound method": (
-        {
-            "made": lambda s: setattr(s, "draw", s.np_random.integers),
-            "move": lambda s, a: (int(s.draw(2)), 0.0, False),
-        },
-        "holds numpy.random._generator.Generator.integers",
-    ),
-    "state outside": (
-        {"move": lambda s, a: (_drawn.append(0) or int(s.np_random.integers(2)), 0.0, False)},
-        "what is outside of its attributes",
+        "does not repeat a walk",
     ),
     "a new generator in reset": (
         {
@@ -546,27 +476,15 @@ UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
         },
         "makes another np_random",
     ),
-    "one that is asked for its class": (
-        {
-            "move": lambda s, a: (
-                int(s.np_random.integers(4)) % 2
-                if type(s.np_random).__name__ == "Generator"
-                else int(s.np_random.integers(10) > 0),
-                0.0,
-                False,
-            )
-        },
-        "not as frequent as was enumerated",
-    ),
     "an early end by chance": (
         {"step": lambda s, a: (0, 0.0, False, bool(s.np_random.random() < 0.5), {})},
         "truncates some episodes earlier",
     ),
     "a class attribute that takes turns": (
         {"move": _guess(lambda s: _in_turn(_Held))},
-        "what is outside of its attributes",
+        "draws otherwise",
     ),
-    "an iterator outside": ({"move": _guess(lambda s: next(_turns))}, "refers to a cycle"),
+    "an iterator outside": ({"move": _guess(lambda s: next(_turns))}, "draws otherwise"),
     "what cannot be read outside": ({"move": _guess(lambda s: _in_turn(_thread))}, "draws otherwise"),
     "a rare end that no reset clears": (
         {"size": 21, "begin": lambda s: 10, "move": _raised},
@@ -581,7 +499,7 @@ UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
             "made": lambda s: setattr(s, "layout", int(s.np_random.integers(2))),
             "move": lambda s, a: (0, float(a == s.layout), False),
         },
-        "its state is not the enumerated one",
+        "is another world each time it is made",
     ),
     "a view of an array": (
         {
@@ -589,13 +507,6 @@ UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
             "move": lambda s, a: (int(s.np_random.integers(2)), 0.0, False),
         },
         "two arrays share memory",
-    ),
-    "what a reset leaves": (
-        {
-            "begin": lambda s: getattr(s, "luck", 0) * 0,
-            "move": lambda s, a: (setattr(s, "luck", int(s.np_random.integers(2))) or 0, 0.0, False),
-        },
-        r"a reset does not always lead to the same state \(in luck\)",
     ),
     "no reward": (
         {"move": lambda s, a: (0, [1.0, np.nan][s.np_random.integers(2)], False)},
@@ -618,7 +529,61 @@ def test_what_is_not_exact_is_refused(compiled: Any, what: str) -> None:
 
 def test_draws_of_pictures_do_not_matter(compiled: Any) -> None:
     members = {"render": lambda self: self.np_random.normal(), "move": lambda self, action: (0, 1.0, False)}
-    assert compiled(type("Drawn", (World,), members)).num_states == 1
+    assert compiled(type("Drawn", (World,), members)).reachable.sum() == 1
+
+
+SOUND: dict[str, tuple[dict[str, Any], float]] = {  # and what a step pays in the mean, with action 1
+    "a generator of its own": (
+        {
+            "made": lambda s: setattr(s, "rng", np.random.Generator(np.random.PCG64(3))),
+            "move": lambda s, a: (0, float(s.rng.integers(4) == 0), False),
+        },
+        0.25,
+    ),
+    "a method of the generator": (
+        {
+            "made": lambda s: setattr(s, "draw", s.np_random.integers),
+            "move": lambda s, a: (0, float(s.draw(5) == 0), False),
+        },
+        0.2,
+    ),
+    "a generator that is asked for its kind": (
+        {"move": lambda s, a: (0, float(isinstance(s.np_random, np.random.Generator)), False)},
+        1.0,
+    ),
+    "a sample of the actions": (
+        {"move": lambda s, a: (0, float(s.action_space.sample()), False)},
+        0.5,
+    ),
+    "a draw that is kept, and not used": (
+        {"move": lambda s, a: (s.__dict__.update(last=s.np_random.random()) or 0, 1.0, False)},
+        1.0,
+    ),
+    "what a reset leaves, and nothing reads": (
+        {
+            "move": lambda s, a: (
+                setattr(s, "luck", int(s.np_random.integers(2))) or 0,
+                float(s.np_random.integers(2)),
+                False,
+            ),
+        },
+        0.5,
+    ),
+    "what is noted elsewhere, and not read": (
+        {"move": lambda s, a: (_drawn.append(0) or 0, float(s.np_random.integers(2)), False)},
+        0.5,
+    ),
+}
+
+
+@pytest.mark.parametrize("what", SOUND)
+def test_what_can_be_taken_into_account_is(compiled: Any, what: str) -> None:
+    members, mean = SOUND[what]
+    mdp = compiled(type("Sound", (World,), members))
+    assert mdp.reachable.sum() == 1
+    assert (mdp.probability * mdp.reward).sum(axis=2)[mdp.start_states[0], 1] == pytest.approx(
+        mean, abs=1e-12
+    )
 
 
 class SecondCard(gym.Env[Any, int]):

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from gridworld.base.errors import InputError
-from gridworld.world.enumeration import branching
-from gridworld.world.enumeration.branching import Branching
+from gridworld.world.door import branching
+from gridworld.world.door.branching import Branching
 
 DRAWN = 4000
 SHARES = [0.1, 0.2, 0.3, 0.4]

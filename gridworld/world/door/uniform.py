@@ -16,7 +16,7 @@ import numpy as np
 from gridworld.world.mdp import IntArray
 
 if TYPE_CHECKING:
-    from gridworld.world.enumeration.branching import Branching
+    from gridworld.world.door.branching import Branching
 
 Weights = tuple[int, ...]  # of outcomes, in proportion to their probabilities
 
@@ -66,6 +66,17 @@ class Uniform:
         width = abs(scale)
         if width and not (abs(offset) <= _MOST_SHIFTED * width and 1 <= width * _WIDEST <= _WIDEST**2):
             self._refuse()
+
+    def parts(self) -> tuple[Any, ...]:
+        """What is known of it, for a copy."""
+        return tuple(self._interval), self._scale, self._offset, self._is_numpys
+
+    @classmethod
+    def of_earlier(cls, branching: Branching, interval: Any, *rest: Any) -> Uniform:
+        """One of an earlier step."""
+        found = cls(branching, "in an earlier step", list(interval), *rest)
+        found._run = -1
+        return found
 
     def _refuse(self, *_: Any, **__: Any) -> Any:
         self._branching.refuse(

@@ -23,10 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError
-from gridworld.world.enumeration import uniform
-from gridworld.world.enumeration.uniform import MOST_OUTCOMES, Uniform, Weights, weights_of
+from gridworld.world.door import uniform
+from gridworld.world.door.uniform import MOST_OUTCOMES, Uniform, Weights, weights_of
 from gridworld.world.mdp import IntArray
 
+OURS = {__file__, uniform.__file__}  # files whose lines are not the environment's
 Result = TypeVar("Result", bound=Hashable)
 Share = tuple[int, int]  # of all outcomes: numerator and denominator, not in lowest terms
 
@@ -165,7 +166,7 @@ class Branching:
     def line() -> str:
         """The file and line that called into this module, or compared one of its numbers."""
         frame = sys._getframe(1)
-        while frame.f_back is not None and frame.f_code.co_filename in (__file__, uniform.__file__):
+        while frame.f_back is not None and frame.f_code.co_filename in OURS:
             frame = frame.f_back
         return f"{frame.f_code.co_filename}:{frame.f_lineno}"
 

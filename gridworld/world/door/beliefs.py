@@ -11,6 +11,8 @@ Reference: K. J. Åström, Optimal control of Markov processes with incomplete s
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -83,6 +85,7 @@ class Beliefs:
         steps: of each hidden state the outcomes of each action; empty where none was tried.
         refusal: makes an error of a reason.
         most: more nodes are refused.
+        most_seconds: the time after which it is given up.
     """
 
     def __init__(
@@ -91,8 +94,10 @@ class Beliefs:
         steps: Sequence[Sequence[Sequence[Step]]],
         refusal: Callable[[str], InputError],
         most: int,
+        most_seconds: float = math.inf,
     ) -> None:
         self._refusal, self._most, self._num_parts = refusal, most, 0
+        self._until = time.monotonic() + most_seconds
         self.nodes: list[Node] = []
         self._numbers: dict[tuple[Belief, bytes], int] = {}
         first: dict[bytes, list[tuple[int, Fraction]]] = {}
@@ -132,11 +137,14 @@ class Beliefs:
             self.nodes.append(Node(belief, seen))
             self._num_parts += len(belief)
             is_long = max(each.denominator.bit_length() for _, each in belief) > _MOST_BITS
-            if len(self.nodes) > self._most or self._num_parts > _MOST_PARTS or is_long:
+            is_many = len(self.nodes) > self._most or self._num_parts > _MOST_PARTS or is_long
+            if is_many or time.monotonic() > self._until:
                 raise self._refusal(
-                    f"what histories say of its hidden state has no end: after {len(self.nodes):,} different "
-                    f"distributions of {self._num_parts:,} probabilities there are more; show more of the "
-                    "state, or set a limit (env.kwargs.max_episode_steps)"
+                    "its observations do not show its state, and what histories say of it has no end in "
+                    "the time or "
+                    f"size allowed: after {len(self.nodes):,} different distributions of {self._num_parts:,} "
+                    "probabilities there are more; show more of the state, or set a limit "
+                    "(env.kwargs.max_episode_steps)"
                 )
         return total, self._numbers[key]
 

@@ -1,0 +1,125 @@
+"""What is known of the classes of others, by the class objects themselves, never by names alone."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import wrappers
+
+# Wrappers that change neither what is seen nor what happens; the second row is of others, if imported.
+_NEUTRAL = (
+    wrappers.AddWhiteNoise,
+    wrappers.Autoreset,
+    wrappers.HumanRendering,
+    wrappers.ObstructView,
+    wrappers.OrderEnforcing,
+    wrappers.PassiveEnvChecker,
+    wrappers.RecordEpisodeStatistics,
+    wrappers.RecordVideo,
+    wrappers.RenderCollection,
+)
+_NEUTRAL_ELSEWHERE = (("stable_baselines3.common.monitor", "Monitor"),)
+_ONE_STEP = (gym.Wrapper, gym.ObservationWrapper, gym.RewardWrapper, gym.ActionWrapper)
+# What only draws, sounds or waits: it is no state.
+_KEPT = (
+    ("pygame.time", "Clock"),
+    ("pygame", "Surface"),
+    ("pygame.font", "Font"),
+    ("pygame.freetype", "Font"),
+    ("pygame.mixer", "Sound"),
+    ("pygame.mixer", "Channel"),
+    ("pygame.event", "Event"),
+    ("pygame._sdl2.video", "Window"),
+    ("logging", "Logger"),
+)
+
+
+def _loaded(names: tuple[tuple[str, str], ...]) -> tuple[Any, ...]:
+    found = (getattr(sys.modules.get(module), name, None) for module, name in names)
+    return tuple(each for each in found if each is not None)
+
+
+def is_neutral(layer: Any) -> bool:
+    """Whether a wrapper runs the step and the reset of a neutral class."""
+    held = getattr(layer, "__dict__", {})
+    return (
+        "step" not in held
+        and "reset" not in held
+        and any(
+            isinstance(layer, each) and type(layer).step is each.step and type(layer).reset is each.reset
+            for each in (*_NEUTRAL, *_loaded(_NEUTRAL_ELSEWHERE))
+        )
+    )
+
+
+def is_limit(layer: Any) -> bool:
+    """Whether a wrapper is Gymnasium's time limit."""
+    return type(layer) is wrappers.TimeLimit and "step" not in vars(layer) and "reset" not in vars(layer)
+
+
+def steps_once(layer: Any) -> bool:
+    """Whether a step of a wrapper is one step of what it wraps."""
+    return "step" not in vars(layer) and any(type(layer).step is each.step for each in _ONE_STEP)
+
+
+@lru_cache(1024)
+def _is_kept(kind: type, loaded: tuple[Any, ...]) -> bool:
+    return issubclass(kind, loaded)
+
+
+def is_kept(kind: type) -> bool:
+    """Whether objects of a class are no state."""
+    return _is_kept(kind, _loaded(_KEPT))
+
+
+def _hand(env: Any) -> Any:
+    """Blackjack's player: all that its rules read is the sum, an ace, and where it matters a natural."""
+    is_natural = (env.sab or env.natural) and sorted(env.player) == [1, 10]
+    return env.dealer, sum(env.player), 1 in env.player, is_natural
+
+
+def state_reader(env: Any) -> Callable[[Any], Any] | None:
+    """What the state of a known environment is, where its attributes hold more than matters."""
+    kind: Any = getattr(sys.modules.get("gymnasium.envs.toy_text.blackjack"), "BlackjackEnv", None)
+    is_blackjack = kind is not None and type(env) is kind
+    return _hand if is_blackjack else None
+
+
+@contextmanager
+def patched(env: Any) -> Iterator[None]:
+    """MiniGrid draws cells until one fits, and counts its tries: draw among those that fit instead."""
+    kind: Any = getattr(sys.modules.get("minigrid.minigrid_env"), "MiniGridEnv", None)
+    if kind is None or not isinstance(env, kind):
+        yield
+        return
+    original = kind.place_obj
+
+    def place_obj(
+        self: Any, obj: Any, top: Any = None, size: Any = None, reject_fn: Any = None, **more: Any
+    ) -> Any:
+        left, upper = (max(each, 0) for each in top or (0, 0))
+        wide, high = size or (self.grid.width, self.grid.height)
+        cells = [
+            (column, row)
+            for column in range(left, min(left + wide, self.grid.width))
+            for row in range(upper, min(upper + high, self.grid.height))
+            if self.grid.get(column, row) is None
+            and tuple(self.agent_pos) != (column, row)
+            and not (reject_fn and reject_fn(self, (column, row)))
+        ]
+        cell = cells[int(self.np_random.integers(len(cells)))]
+        self.grid.set(*cell, obj)
+        if obj is not None:
+            obj.init_pos = obj.cur_pos = cell
+        return cell
+
+    kind.place_obj = place_obj
+    try:
+        yield
+    finally:
+        kind.place_obj = original

@@ -1,0 +1,483 @@
+"""What an environment holds: the attributes of all its layers, copied together and put back.
+
+The layers are an environment's wrappers and itself. Neutral wrappers (`known`) are left out; all others hold
+state like the environment does. Attributes that are large and never change are left in place; everything
+else is in one pickle, so that what is the same object stays the same object. Spaces, code, and what only
+draws or waits are kept as they are. A random generator that is held when the search begins is replaced by
+the one that takes every outcome. The environment gets back its own attributes in the end.
+"""
+
+from __future__ import annotations
+
+import collections
+import copyreg
+import functools
+import hashlib
+import inspect
+import io
+import itertools
+import math
+import pickle
+import random
+import sys
+import types
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from operator import itemgetter
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from gridworld.base.errors import InputError, in_short
+from gridworld.world.door import known
+from gridworld.world.door.uniform import Uniform
+
+Env = gym.Env[Any, Any]
+_ATOMS = frozenset({type(None), bool, int, float, complex, str, bytes, *np.sctypeDict.values()})
+_CODE = (type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, np.ufunc)
+_KEPT = (gym.Space, gym.envs.registration.EnvSpec, *_CODE)
+_SMALL, _LARGE = 1024, 256  # bytes of all copies, up to which all is copied; beyond it, of one attribute
+_PLAIN = frozenset({list, tuple, dict, set, frozenset, collections.deque})
+_CONTAINERS = (list, tuple, dict, set, frozenset, np.ndarray)  # whose own reduction holds their items
+
+
+GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
+_MARK = object()  # in place of any generator
+
+
+class Changed(Exception):  # noqa: N818
+    """Attributes that were left in place have changed: the search begins again with copies of them."""
+
+    def __init__(self, found: Sequence[tuple[int, str]]) -> None:
+        super().__init__(found)
+        self.found = found
+
+
+class Timed(BaseException):  # which an environment's `except Exception` does not catch
+    """A wrapper reads or changes what a time limit below it does, so that its count is state."""
+
+
+class Limited(gym.Wrapper[Any, Any, Any, Any]):
+    """Stands for a time limit: it counts the steps of one step, and cuts the episode when it is told to."""
+
+    def __init__(self, env: Env) -> None:
+        super().__init__(env)
+        self.steps, self.cuts = 0, False
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.steps += 1
+        return observation, reward, terminated, truncated or self.cuts, info
+
+    @property
+    def _elapsed_steps(self) -> int:
+        raise Timed
+
+
+class Layers:
+    """The layers of an environment, the outermost first, and copies of what they hold.
+
+    Args:
+        where: what messages call the environment.
+        env: it is changed, and left as it was by `restored`.
+        branching: the generator in place of every other.
+        counts_time: whether the count of a `TimeLimit` is state too, since something reads it.
+    """
+
+    def __init__(self, where: str, env: Env, branching: Any, counts_time: bool = False) -> None:
+        self._where, self.branching = where, branching
+        self.limit: int | None = None
+        self.layers: list[Any] = []
+        self.limited: Limited | None = None  # in place of a time limit below a wrapper
+        chain: list[Any] = []
+        for layer in layers_of(env):
+            if known.is_limit(layer) and not counts_time:
+                most = int(vars(layer)["_max_episode_steps"])
+                if most > 0:  # -1 is "none" to `gymnasium.make`
+                    self.limit = most if self.limit is None else min(self.limit, most)
+                if self.limited is None and self.layers:
+                    self.limited = Limited(layer.env)
+                    chain.append(self.limited)
+            elif not known.is_neutral(layer):
+                self.layers.append(layer)
+                chain.append(layer)
+        self._chain = chain  # without the neutral ones
+        self.may_see_cuts = self.limited is not None and not all(map(known.steps_once, self.layers[:-1]))
+        self.env: Any = self.layers[0]
+        self.base: Any = self.layers[-1]
+        self.fixed: dict[Any, Any] = {id(each): each for each in (*chain, branching)}
+        self._known = self.fixed  # and what is within attributes that are left in place
+        self._shares = False  # whether lists and dictionaries are among these
+        self._left: list[list[tuple[str, Any]]] = [[] for _ in self.layers]  # in place, by layers
+        self._digest_left = b""
+        self._generators: list[tuple[Any, Any]] = []  # others than numpy's, with their states
+        self.is_adopting = False
+        self.ordinary: set[Any] = set(_PLAIN)  # classes whose objects are copied, unless they are known
+
+    @contextmanager
+    def restored(self) -> Iterator[None]:
+        """Work on copies; in the end every layer holds the very objects that it held."""
+        before = [(layer, attributes(layer)) for layer in self.layers]
+        values = [each for layer, held in before for each in (*held.values(), *_own_spaces(layer))]
+        spaces = {id(space): (space, vars(space).get("_np_random")) for space in _spaces(values)}.values()
+        self._shared = random_states()
+        try:
+            self._adopt()
+            for space, _ in spaces:
+                vars(space)["_np_random"] = self.branching
+            with known.patched(self.base):
+                yield
+        finally:
+            for layer, held in before:
+                set_attributes(layer, held)
+            for space, generator in spaces:
+                vars(space)["_np_random"] = generator
+
+    def check_generators(self) -> None:
+        """Refuse draws from generators that cannot be replaced."""
+        if random_states() != self._shared or any(
+            state_of(each) != state for each, state in self._generators
+        ):
+            raise InputError(
+                f"{self._where}: it draws from another generator than self.np_random (numpy's or "
+                "Python's own), "
+                "so its outcomes cannot be enumerated; draw from self.np_random"
+            )
+
+    def _adopt(self) -> None:
+        """Put copies in place of everything, and the generator that branches in place of every other."""
+        self.is_adopting = True
+        held = [attributes(layer) for layer in self.layers]
+        try:
+            copy = self._load(self._dump([list(each.items()) for each in held]))
+        except Exception as error:
+            raise self._uncopied(held, error) from error
+        finally:
+            self.is_adopting = False
+        for layer, items in zip(self.layers, copy, strict=True):
+            set_attributes(layer, dict(items))
+        for outer, inner in itertools.pairwise(self._chain):
+            outer.env = inner
+        if isinstance(self.base, gym.Env):
+            self.base._np_random = self.branching
+        if getattr(self.base, "render_mode", None) == "human":
+            self.base.render_mode = None
+
+    def _uncopied(self, held: list[dict[str, Any]], error: Exception) -> InputError:
+        if isinstance(error, InputError):
+            return error
+        for each in held:
+            for name, value in each.items():
+                try:
+                    self._dump(value)
+                except Exception as reason:
+                    return InputError(
+                        f"{self._where}: its attribute {name} cannot be copied ({in_short(reason)}); hold "
+                        "numbers, lists, numpy arrays or plain objects"
+                    )
+        return InputError(f"{self._where}: its attributes cannot be copied ({in_short(error)})")
+
+    def leave(self, changing: set[tuple[int, str]]) -> None:
+        """Leave in place what is not known to change: single values, and what is large if all of it is."""
+        held = [
+            (number, name, value)
+            for number, layer in enumerate(self.layers)
+            for name, value in attributes(layer).items()
+            if (number, name) not in changing
+        ]
+        most = _LARGE if len(self.take()) > _SMALL else math.inf
+        self._left = [
+            [
+                (name, value)
+                for at, name, value in held
+                if at == number and (self._is_one(value) or len(self._dump(value)) > most)
+            ]
+            for number in range(len(self.layers))
+        ]
+        self._digest_left = self._content_left()
+        recorder = _Recorder(self)
+        for _, value in itertools.chain.from_iterable(self._left):
+            recorder.dump(value)
+        # One object stays one, wherever it is held.
+        self._known = self.fixed | {id(each): each for each in recorder.met}
+        self._shares = any(type(each) in _PLAIN for each in recorder.met)
+
+    def _is_one(self, value: Any) -> bool:
+        """Whether a value cannot change but by another in its place."""
+        return type(value) in _ATOMS or id(value) in self.fixed
+
+    def leave_nothing(self) -> None:
+        """Everything is in the copies."""
+        self._left = [[] for _ in self.layers]
+        self._known, self._shares = dict(self.fixed), False
+
+    def _content_left(self) -> bytes:
+        return self._dump([[value for _, value in left] for left in self._left], self.fixed)
+
+    def check_left(self) -> None:
+        """Raise `Changed` if what was left in place has changed after all."""
+        if self._content_left() != self._digest_left:
+            raise Changed([(number, name) for number, left in enumerate(self._left) for name, _ in left])
+
+    def take(self, without: Sequence[str] = ()) -> bytes:
+        """A copy of the state. Equal copies are of equal states; equal states may have several."""
+        return self._dump(self._held(without))
+
+    def _held(self, without: Sequence[str] = ()) -> list[list[tuple[str, Any]]]:
+        held = []
+        for number, (layer, left) in enumerate(zip(self.layers, self._left, strict=True)):
+            found = attributes(layer)
+            for name, value in left:
+                now = found.pop(name, Changed)
+                if now is not value and not (type(now) is type(value) in _ATOMS and now == value):
+                    raise Changed([(number, name)])
+            held.append(sorted((item for item in found.items() if item[0] not in without), key=itemgetter(0)))
+        return held
+
+    def put(self, copy: bytes) -> None:
+        """Make a copy the state of all layers."""
+        for layer, items, left in zip(self.layers, self._load(copy), self._left, strict=True):
+            set_attributes(layer, dict(items + left))
+
+    def everything(self, *more: Any) -> bytes:
+        """A copy of every attribute, and of `more`; what cannot be copied raises whatever it raises."""
+        return self._dump([*more, *(attributes(layer) for layer in self.layers)], self.fixed)
+
+    def names(self) -> list[str]:
+        """The names of all attributes."""
+        return [name for layer in self.layers for name in attributes(layer)]
+
+    def values(self, ignore: Sequence[str] = ()) -> dict[tuple[int, str], bytes]:
+        """A copy of each attribute that is not left in place, by the number of its layer and its name."""
+        return {
+            (number, name): self._dump(value)
+            for number, items in enumerate(self._held(ignore))
+            for name, value in items
+        }
+
+    def _dump(self, thing: Any, known_objects: dict[Any, Any] | None = None) -> bytes:
+        buffer = io.BytesIO()
+        known_objects = self._known if known_objects is None else known_objects
+        shares = self._shares and known_objects is self._known
+        (_Pickler if shares else _Copier)(buffer, self, known_objects).dump(thing)
+        return buffer.getvalue()
+
+    def _load(self, copy: bytes) -> Any:
+        return _Unpickler(io.BytesIO(copy), self._known, self.branching).load()
+
+    def _keep(self, thing: Any) -> int:
+        self.fixed[id(thing)] = self._known[id(thing)] = thing
+        return id(thing)
+
+    def reference(self, thing: Any) -> Any:
+        """What stands in a copy for an object that is kept as it is; None for any other."""
+        kind = type(thing)
+        if kind is Uniform:
+            return "drawn", *thing.parts()
+        if isinstance(thing, _KEPT) or known.is_kept(kind):
+            return self._keep(thing)
+        if isinstance(thing, np.random.Generator):
+            if not self.is_adopting:
+                raise InputError(
+                    f"{self._where}: reset() or step() makes another np_random, whose draws cannot be "
+                    "enumerated; "
+                    "draw from self.np_random, and leave seeding to super().reset(seed=seed)"
+                )
+            return id(self.branching)
+        if isinstance(thing, np.random.RandomState | random.Random):
+            self._generators.append((thing, state_of(thing)))
+            return self._keep(thing)
+        if kind is np.ndarray and self.is_adopting:
+            return self._keep(thing) if not thing.flags.writeable and thing.base is None else None
+        self.ordinary.add(kind)
+        return None
+
+
+class _Copier(pickle.Pickler):
+    """Copies what no attribute left in place shares a list or a dictionary with."""
+
+    def __init__(self, file: io.BytesIO, held: Layers, known_objects: dict[Any, Any]) -> None:
+        super().__init__(file, protocol=5)
+        self._held, self._known = held, known_objects
+        self._views: dict[int, list[Any]] = {}  # arrays by that whose memory they show
+
+    def reducer_override(self, obj: Any) -> Any:
+        if obj is _kept:
+            return NotImplemented
+        key = id(obj) if id(obj) in self._known else None
+        if key is None and type(obj) not in self._held.ordinary:
+            key = self._held.reference(obj)
+        return (_kept, (key,)) if key is not None else self._taken_apart(obj)
+
+    def _taken_apart(self, obj: Any) -> Any:
+        if isinstance(obj, np.ndarray):
+            views = self._views.setdefault(id(obj if obj.base is None else obj.base), [])
+            if any(np.may_share_memory(obj, each) for each in views):
+                raise TypeError("two arrays share memory; hold one of them")
+            views.append(obj)
+        elif _is_taken_apart(_kind(obj)):
+            held = attributes(obj)
+            if self._held.is_adopting and isinstance(obj, gym.Env):  # which would make a generator when asked
+                held["_np_random"] = self._held.branching
+            return _new, (type(obj),), held, None, None, set_attributes
+        return NotImplemented
+
+
+class _Pickler(_Copier):
+    """Asks of lists and dictionaries too whether they are known, which takes three times as long."""
+
+    def persistent_id(self, obj: Any) -> Any:
+        kind = type(obj)
+        if kind in _ATOMS or obj is _kept:
+            return None
+        if (key := id(obj)) in self._known:
+            return key
+        return None if kind in self._held.ordinary else self._held.reference(obj)
+
+    def reducer_override(self, obj: Any) -> Any:
+        return self._taken_apart(obj)
+
+
+class _Recorder(_Pickler):
+    """Notes every object within what it is given."""
+
+    def __init__(self, held: Layers) -> None:
+        super().__init__(io.BytesIO(), held, held.fixed)
+        self.met: list[Any] = []
+
+    def persistent_id(self, obj: Any) -> Any:
+        found = super().persistent_id(obj)
+        if found is None and type(obj) not in _ATOMS:
+            self.met.append(obj)
+        return found
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, known_objects: dict[Any, Any], branching: Any) -> None:
+        super().__init__(file)
+        self._known, self._branching = known_objects, branching
+
+    def persistent_load(self, key: Any) -> Any:
+        if isinstance(key, tuple):  # a number drawn in an earlier step, which nothing may compare any more
+            return Uniform.of_earlier(self._branching, *key[1:])
+        return self._known[key]
+
+    def find_class(self, module: str, name: str) -> Any:
+        ours = (module, name) == (_kept.__module__, _kept.__name__)
+        return self.persistent_load if ours else super().find_class(module, name)
+
+
+def _kept(key: Any) -> Any:
+    """What a copy says in place of an object that is kept as it is; `_Unpickler` reads it."""
+    raise NotImplementedError
+
+
+_new: Any = vars(copyreg)["__newobj__"]  # which pickle knows as a call of __new__
+
+
+def _kind(thing: Any) -> Any:
+    return type(thing)
+
+
+def layers_of(env: Any) -> list[Any]:
+    """An environment's wrappers, the outermost first, and at last itself."""
+    found = [env]
+    while isinstance(found[-1], gym.Wrapper):
+        found.append(found[-1].env)
+    return found
+
+
+def attributes(thing: Any) -> dict[str, Any]:
+    """What an object holds, in slots too."""
+    found = dict(getattr(thing, "__dict__", {}))
+    for name in _slots(_kind(thing)):
+        try:
+            found[name] = getattr(thing, name)
+        except AttributeError:
+            continue
+    return found
+
+
+def set_attributes(thing: Any, held: dict[str, Any]) -> None:
+    """Make an object hold this and nothing else."""
+    slots = _slots(_kind(thing))
+    if hasattr(thing, "__dict__"):
+        vars(thing).clear()
+        vars(thing).update({name: value for name, value in held.items() if name not in slots})
+    for name in slots:
+        if name in held:
+            object.__setattr__(thing, name, held[name])
+        elif hasattr(thing, name):
+            object.__delattr__(thing, name)
+
+
+@functools.lru_cache(1024)
+def _slots(kind: Any) -> tuple[str, ...]:
+    names = (
+        name
+        for each in kind.__mro__
+        for name, member in vars(each).items()
+        if inspect.ismemberdescriptor(member)
+    )
+    return tuple(name for name in names if name not in ("__dict__", "__weakref__"))
+
+
+@functools.lru_cache(1024)
+def _is_taken_apart(kind: Any) -> bool:
+    """Whether its instances are copied attribute by attribute, for their own way may leave something out."""
+    if issubclass(kind, gym.Env):
+        return True
+    root = kind.__module__.partition(".")[0]
+    if (
+        root in sys.stdlib_module_names
+        or root in ("numpy", "torch", "pygame")
+        or issubclass(kind, _CONTAINERS)
+    ):
+        return root == "__main__" and not issubclass(kind, _CONTAINERS) and _has_its_own_way(kind)
+    return _has_its_own_way(kind)
+
+
+def _has_its_own_way(kind: type) -> bool:
+    own = ("__getstate__", "__reduce__", "__reduce_ex__")
+    return any(getattr(kind, name, None) is not getattr(object, name, None) for name in own)
+
+
+def _own_spaces(layer: Any) -> list[Any]:
+    return [
+        getattr(layer, name, None) for name in ("action_space", "observation_space")
+    ]  # of its class, maybe
+
+
+def _spaces(held: Any) -> Iterator[gym.Space[Any]]:
+    for each in held:
+        if isinstance(each, gym.Space):
+            yield each
+            inner = getattr(each, "spaces", ())
+            yield from _spaces(inner.values() if isinstance(inner, dict) else inner)
+
+
+def contents(env: Env) -> dict[str, bytes]:
+    """The content of each attribute of an environment, to compare it with another's."""
+    layers = Layers("env", env.unwrapped, _MARK)
+    layers.is_adopting = True
+    skipped = {
+        name for name, value in attributes(layers.base).items() if isinstance(value, (*_KEPT, *GENERATORS))
+    }
+    return {name: value for (_, name), value in layers.values([*skipped, "_np_random_seed"]).items()}
+
+
+def random_states() -> list[Any]:
+    """The states of the generators that all share."""
+    torch = sys.modules.get("torch")
+    found = [] if torch is None else [torch.get_rng_state().numpy().tobytes()]
+    numpys: Any = np.random.get_state(legacy=False)["state"]
+    return [*found, random.getstate(), (numpys["key"].tobytes(), numpys["pos"])]
+
+
+def state_of(generator: Any) -> bytes:
+    """The state of a random generator."""
+    if isinstance(generator, random.Random):
+        return hashlib.sha256(repr(generator.getstate()).encode()).digest()
+    bits = getattr(generator, "bit_generator", None)
+    return pickle.dumps(generator.get_state(legacy=False) if bits is None else bits.state)

@@ -1,0 +1,223 @@
+"""The world of an environment, by trying every action in a copy of every state.
+
+    layers        what its wrappers and itself hold, copied and put back
+    search        the states, and what each action does there
+    rejection     the generator in place of its own, which takes every outcome of every draw
+    beliefs       what observations leave open of the state; states that are alike are one
+
+The step limit is that of a `TimeLimit`, or the one at which the environment truncates by itself. A state at
+its own limit is not terminal, since the environment does not say so, but every action stays there and pays
+nothing. An end is a success if it pays more than 0, and if none does, if it pays best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from gridworld.base.user_input import check_memory
+from gridworld.world.door.beliefs import Beliefs, Node
+from gridworld.world.door.layers import Env
+from gridworld.world.door.search import MOST_SECONDS, MOST_STATES, Named, Search, State
+from gridworld.world.mdp import ENUMERATED, Mdp
+from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the search found of an environment.
+
+    Attributes:
+        mdp: its world.
+        space: of its observations.
+        rows: the observation of each state, (S, *shape), by the keys of a Dict; None: they are no arrays.
+        masks: (S, A), the actions that `action_masks()` allows; None: it has none.
+    """
+
+    mdp: Mdp
+    space: gym.Space[Any]
+    rows: Any
+    masks: NDArray[np.bool_] | None
+
+
+def enumerated(
+    where: str,
+    env: Env,
+    *,
+    name: str = "",
+    ignore: Sequence[str] = (),
+    state: Callable[[Any], Any] | None = None,
+    most_states: int = MOST_STATES,
+    most_seconds: float = MOST_SECONDS,
+) -> Found:
+    """Find the world of an environment, wrappers included, which is left as it was.
+
+    Args:
+        where: what messages call it.
+        env: the environment.
+        name: of the world; its class's if none is given.
+        ignore: attributes that are no part of its state, by the user's word.
+        state: a function of the environment without wrappers that is its whole state, by the user's word.
+        most_states: more are refused as soon as they are found.
+        most_seconds: a search that takes longer is refused.
+
+    Raises:
+        InputError: it has no such world, or none within these bounds.
+    """
+    search = Search(where, env, ignore, state, most_states, most_seconds)
+    search.explore()
+    return _World(search, name or type(env.unwrapped).__name__, by_word=state is not None).found
+
+
+class _World:
+    """The world of what a search found; its states are `beliefs` about the environment's own."""
+
+    def __init__(self, search: Search, name: str, by_word: bool) -> None:
+        self.search, self._by_word = search, by_word
+        classes = list(search.classes)
+        members: dict[int, list[State]] = {}
+        for state, number in zip(search.states, classes, strict=True):
+            members.setdefault(number, []).append(state)
+        self.members = [*(members[number] for number in range(len(members))), []]
+        classes.append(len(members))  # what is over, as the last
+        first = [
+            [[each._replace(following=classes[each.following]) for each in row] for row in found[0].steps]
+            for found in self.members[:-1]
+        ]
+        starts = [(each.probability, classes[each.following], each.seen) for each in search.starts]
+        self.beliefs = beliefs = Beliefs(
+            starts, [*first, []], search.refusal, MOST_STATES, search.seconds_left()
+        )
+        space, numbers, size = search.env.observation_space, *self._numbers()
+        named: list[Named] = [self._unreached(number) for number in range(size)]
+        leaves: list[Any] = [None] * size
+        masks = np.ones((size, search.num_actions), dtype=np.bool_)
+        for node, number in reversed(list(zip(beliefs.nodes, numbers.tolist(), strict=True))):
+            named[number], leaves[number] = self._name(node), search.observations[node.seen]
+            masks[number] = self._mask(node)
+        if isinstance(space, spaces.Discrete):
+            leaves = [each or [np.array(space.start + n, space.dtype)] for n, each in enumerate(leaves)]
+        memory = sum(each.nbytes for row in leaves for each in row if not isinstance(each, bytes))
+        check_memory(search.where, memory)
+        found = [place for _, place in named if place is not None]
+        panels, places = list(dict.fromkeys(facing for facing, _, _ in found)), None
+        if len(found) == len(named):
+            places = np.array([(panels.index(facing), row, column) for facing, row, column in found])
+            places[:, 1:] -= places[:, 1:].min(axis=0)  # without the walls around the room
+        limits = [each for each in (search.own_limit(), search.layers.limit) if each is not None]
+        rows = _stacked(space, iter(zip(*leaves, strict=True)))
+        mdp = mdp_from_outcomes(
+            name,
+            _renumbered(beliefs.outcomes(name, search.num_actions), numbers, size),
+            action_names=search.action_names(),
+            places=places,
+            panel_names=panels,
+            max_episode_steps=min(limits, default=None),
+            own_observation=_own(space, rows),
+        )
+        names = tuple(each for each, _ in named)
+        mdp = replace(mdp, state_names=names if all(names) else (), truth=self._truth())
+        shown = _taken(rows, mdp.number)
+        self.found = Found(mdp, space, shown, masks[mdp.number] if search.has_masks else None)
+
+    def _numbers(self) -> tuple[NDArray[Any], int]:
+        """The number of each node in the tables, the environment's own if it has such; how many there are."""
+        space, nodes = self.search.env.observation_space, self.beliefs.nodes
+        acting = [node.seen for node in nodes if node.rows]
+        if isinstance(space, spaces.Discrete) and space.n <= MOST_STATES and len(set(acting)) == len(acting):
+            shown = [int(self.search.observations[node.seen][0]) - int(space.start) for node in nodes]
+            return np.array(shown), int(space.n)
+        return np.arange(len(nodes)), len(nodes)
+
+    def _unreached(self, number: int) -> Named:
+        return f"observation {number}", None
+
+    def _mask(self, node: Node) -> tuple[bool, ...]:
+        """The actions that are allowed where a node's observation is shown."""
+        everything = (True,) * self.search.num_actions
+        found = {each.mask or everything for each in self._possible(node)} or {everything}
+        if len(found) > 1 or any(len(each) != self.search.num_actions for each in found):
+            raise self.search.refusal(
+                "action_masks() tells apart what the observations do not, or has not one entry for each "
+                "of its "
+                f"{self.search.num_actions} actions; show what it depends on"
+            )
+        return found.pop()
+
+    def _possible(self, node: Node) -> list[State]:
+        """The environment's own states that a belief does not rule out; none where the episode is over."""
+        return [state for number, _ in node.belief for state in self.members[number]]
+
+    def _name(self, node: Node) -> Named:
+        """What a reader calls a node: as its states, or by what is shown there."""
+        found = {(each.name, each.place) for each in self._possible(node)} or {self.search.ends[node.seen]}
+        name, place = found.pop() if len(found) == 1 else ("", None)
+        return name or self.search.shown[node.seen], place
+
+    def _truth(self) -> str:
+        ignored = f" without {', '.join(self.search.ignore)}, as you asked" if self.search.ignore else ""
+        without = f"{ignored}, of which state= says all" if self._by_word else ignored
+        size, nodes = len(self.members) - 1, self.beliefs.nodes
+        if all(len(each.belief) == 1 for each in nodes):
+            found = f"{ENUMERATED}, {len(nodes):,} states{without}"
+        else:
+            found = f"{ENUMERATED}, {len(nodes):,} beliefs about {size:,} hidden states{without}"
+        aliased = self.beliefs.num_aliased()
+        return f"{found}; {aliased:,} observations stand for several of them" if aliased else found
+
+
+def _renumbered(outcomes: Outcomes, numbers: NDArray[Any], size: int) -> Outcomes:
+    """The same with other numbers; of nodes with one number, an end and another, the other's row counts."""
+    actions, count = outcomes.next_state.shape[1:]
+    tables: dict[str, Any] = {
+        "next_state": np.tile(np.arange(size)[:, None, None], (1, actions, count)),
+        "probability": np.tile(np.eye(count)[0], (size, actions, 1)),
+        "reward": np.zeros((size, actions, count)),
+        "terminated": np.zeros((size, actions, count), dtype=np.bool_),
+    }
+    is_end = (outcomes.next_state == np.arange(len(numbers))[:, None, None]).all(axis=(1, 2))
+    order = np.argsort(~is_end, kind="stable")  # ends first, so that others overwrite them
+    for key, table in tables.items():
+        given = getattr(outcomes, key)
+        table[numbers[order]] = numbers[given[order]] if key == "next_state" else given[order]
+    start = np.zeros(size)
+    np.add.at(start, numbers, outcomes.start)
+    success = None
+    if outcomes.success is not None:
+        success = np.zeros((size, actions, count), dtype=np.bool_)
+        success[numbers[order]] = outcomes.success[order]
+    return Outcomes(**tables, start=start, success=success)
+
+
+def _stacked(space: gym.Space[Any], leaves: Any) -> Any:
+    """Observations as arrays of all states, from an iterator over the leaves of a space."""
+    if isinstance(space, spaces.Dict):
+        return {key: _stacked(each, leaves) for key, each in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(_stacked(each, leaves) for each in space.spaces)
+    found = next(leaves)
+    return None if isinstance(found[0], bytes) else np.stack(found)
+
+
+def _taken(rows: Any, nodes: NDArray[Any]) -> Any:
+    if isinstance(rows, dict):
+        return {key: _taken(each, nodes) for key, each in rows.items()}
+    if isinstance(rows, tuple):
+        return tuple(_taken(each, nodes) for each in rows)
+    return None if rows is None else rows[nodes]
+
+
+def _own(space: gym.Space[Any], rows: Any) -> NDArray[Any] | None:
+    """What `observation=own` shows: an array, of a Dict its `image`, of a Tuple of numbers these."""
+    if isinstance(space, spaces.Dict):
+        return rows.get("image") if isinstance(rows.get("image"), np.ndarray) else None
+    if isinstance(space, spaces.Tuple):
+        is_numbers = all(isinstance(each, spaces.Discrete) for each in space.spaces)
+        return np.stack(rows, axis=1).astype(np.int64) if is_numbers and len(rows) else None
+    return rows if isinstance(rows, np.ndarray) else None

@@ -1,0 +1,487 @@
+"""Environments as people have them become exact worlds: wrappers, memory, Dicts, clocks, batches, classes."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pygame
+import pytest
+from gymnasium import spaces, wrappers
+from gymnasium.utils import seeding
+from gymnasium.vector import SyncVectorEnv
+from stable_baselines3 import PPO
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+import gridworld
+from gridworld.base.errors import InputError
+from gridworld.world.door import known
+from gridworld.world.door.world import enumerated
+from gridworld.world.evaluation import Evaluator
+from gridworld.world.mdp import Mdp
+
+GAMMA = 0.99
+Result = tuple[Any, float, bool, bool, dict[str, Any]]
+
+
+def optimum(env: Any, gamma: float = GAMMA) -> float:
+    mdp = gridworld.compile_env(env)
+    return Evaluator(mdp, gamma, mdp.max_episode_steps or 100).optimal_value
+
+
+class Line(gym.Env[Any, int]):
+    """Four places; action 1 goes right, 0 left; the last one pays and ends."""
+
+    observation_space: gym.Space[Any] = spaces.Discrete(4)
+    action_space: gym.Space[Any] = spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.at = 0
+        return self.shown(), {}
+
+    def shown(self) -> Any:
+        return self.at
+
+    def step(self, action: int) -> Result:
+        self.at = min(max(self.at + (1 if action else -1), 0), 3)
+        return self.shown(), float(self.at == 3), self.at == 3, False, {}
+
+
+class Middle(Line):
+    """Starts in the middle of five places, both ends of which end it; the right one pays."""
+
+    observation_space = spaces.Discrete(5)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.at = 2
+        return self.shown(), {}
+
+    def step(self, action: int) -> Result:
+        self.at += 1 if action else -1
+        return self.shown(), float(self.at == 4), self.at in (0, 4), False, {}
+
+
+class OneHot(Middle):
+    observation_space = spaces.Box(0.0, 1.0, (5,), np.float32)
+
+    def shown(self) -> Any:
+        return np.eye(5, dtype=np.float32)[self.at]
+
+
+class LastAction(Line):
+    """Notes the last action, as for drawing; a reset may forget to clear it."""
+
+    clears = True
+
+    def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
+        if self.clears or not hasattr(self, "last"):
+            self.last: int | None = None
+        return super().reset(**given)
+
+    def step(self, action: int) -> Result:
+        self.last = int(action)
+        return super().step(action)
+
+
+class Forgetful(LastAction):
+    clears = False
+
+
+class Clocked(Line):
+    def __init__(self) -> None:
+        self.clock, self.surface = pygame.time.Clock(), pygame.Surface((2, 2))
+
+
+class Moved(Line):
+    """Its place is a pygame rectangle."""
+
+    def __init__(self) -> None:
+        self.rect = pygame.Rect(0, 0, 1, 1)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.rect.x = 0
+        return super().reset(seed=seed)
+
+    def step(self, action: int) -> Result:
+        self.rect.x = min(max(self.rect.x + (1 if action else -1), 0), 3)
+        return self.rect.x, float(self.rect.x == 3), self.rect.x == 3, False, {}
+
+
+class Room:
+    def __init__(self, number: int) -> None:
+        self.number, self.next = number, self
+
+
+class Rooms(Line):
+    """The room is one of a list, told by identity; the list is large enough to be left in place."""
+
+    def __init__(self, count: int = 4) -> None:
+        self.rooms = [Room(number) for number in range(count)]
+        for one, other in zip(self.rooms, self.rooms[1:], strict=False):
+            one.next = other
+        self.goal = self.rooms[-1]
+        self.observation_space = spaces.Discrete(count)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        gym.Env.reset(self, seed=seed)
+        self.room = self.rooms[0]
+        return 0, {}
+
+    def step(self, action: int) -> Result:
+        self.room = self.room.next if action else self.room
+        return self.room.number, float(self.room is self.goal), self.room is self.goal, False, {}
+
+
+class SeededInInit(Line):
+    """The old habit: a generator made in __init__."""
+
+    def __init__(self) -> None:
+        self.np_random, _ = seeding.np_random(None)
+
+    def step(self, action: int) -> Result:
+        return super().step(1 if self.np_random.random() < (0.75 if action else 0.5) else 0)
+
+
+class SampleOfSpace(Line):
+    def step(self, action: int) -> Result:
+        return super().step(self.action_space.sample() if self.np_random.integers(10) == 0 else action)
+
+
+class Target(gym.Env[Any, int]):
+    """Gymnasium's tutorial: a Dict, and a target that is drawn again until it is elsewhere."""
+
+    def __init__(self, size: int = 5) -> None:
+        self.size = size
+        self._agent, self._target = np.array([-1, -1], np.int32), np.array([-1, -1], np.int32)
+        place = spaces.Box(0, size - 1, (2,), dtype=int)
+        self.observation_space = spaces.Dict(
+            {"agent": place, "target": spaces.Box(0, size - 1, (2,), dtype=int)}
+        )
+        self.action_space = spaces.Discrete(4)
+
+    def _shown(self) -> dict[str, Any]:
+        return {"agent": self._agent, "target": self._target}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._agent = self.np_random.integers(0, self.size, size=2, dtype=int)
+        self._target = self._agent
+        while np.array_equal(self._target, self._agent):
+            self._target = self.np_random.integers(0, self.size, size=2, dtype=int)
+        return self._shown(), {}
+
+    def step(self, action: Any) -> Result:
+        move = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[action]
+        self._agent = np.clip(self._agent + move, 0, self.size - 1)
+        over = np.array_equal(self._agent, self._target)
+        return self._shown(), 1 if over else 0, over, False, {}
+
+
+def of_target(size: int) -> float:
+    cells = [np.array(divmod(number, size)) for number in range(size * size)]
+    ways = [np.abs(one - other).sum() for one in cells for other in cells if (one != other).any()]
+    return float(np.mean([GAMMA ** (steps - 1) for steps in ways]))
+
+
+def coin() -> float:
+    """Of SeededInInit, by the equations of its three places."""
+    matrix, right = np.eye(3), np.zeros(3)
+    for at in range(3):
+        for chance, to in ((0.75, at + 1), (0.25, max(at - 1, 0))):
+            if to == 3:
+                right[at] += chance
+            else:
+                matrix[at, to] -= GAMMA * chance
+    return float(np.linalg.solve(matrix, right)[0])
+
+
+def slipping(share: float) -> float:
+    """Of a Line on which a step to the right goes left with this chance."""
+    matrix, right = np.eye(3), np.zeros(3)
+    for at in range(3):
+        for chance, to in ((1 - share, at + 1), (share, max(at - 1, 0))):
+            if to == 3:
+                right[at] += chance
+            else:
+                matrix[at, to] -= GAMMA * chance
+    return float(np.linalg.solve(matrix, right)[0])
+
+
+TRUTH: dict[str, tuple[Callable[[], Any], float]] = {
+    "plain": (Line, GAMMA**2),
+    "a start in the middle": (Middle, GAMMA),
+    "one-hot vectors of its own": (OneHot, GAMMA),
+    "a last action": (LastAction, GAMMA**2),
+    "a last action that no reset clears": (Forgetful, GAMMA**2),
+    "a clock and a surface": (Clocked, GAMMA**2),
+    "a rectangle": (Moved, GAMMA**2),
+    "rooms by identity": (Rooms, GAMMA**2),
+    "many rooms by identity": (lambda: Rooms(40), GAMMA**38),
+    "a generator made in __init__": (SeededInInit, coin()),
+    "a sample of its actions": (SampleOfSpace, slipping(0.05)),
+    "the tutorial": (lambda: Target(3), of_target(3)),
+}
+
+
+@pytest.mark.parametrize("what", TRUTH)
+def test_environments_as_people_have_them(what: str) -> None:
+    make, truth = TRUTH[what]
+    assert optimum(make()) == pytest.approx(truth, abs=1e-12)
+    assert optimum(make) == pytest.approx(truth, abs=1e-12)  # a class or a function
+    assert optimum(wrappers.TimeLimit(make(), 200)) == pytest.approx(truth, abs=1e-12)
+
+
+# ---- wrappers ----------------------------------------------------------------------------------------------
+
+
+class Sticky(gym.Wrapper[Any, Any, Any, Any]):
+    """Repeats the last action with a chance of 1/4."""
+
+    last = 0
+
+    def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
+        self.last = 0
+        return self.env.reset(**given)
+
+    def step(self, action: Any) -> Any:
+        if self.unwrapped.np_random.random() < 0.25:
+            action = self.last
+        self.last = int(action)
+        return self.env.step(action)
+
+
+class Later(gym.RewardWrapper[Any, Any]):
+    """Pays the opposite from the third step on, by a count in a slot."""
+
+    __slots__ = ("count",)
+
+    def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
+        self.count = 0
+        return super().reset(**given)
+
+    def reward(self, reward: Any) -> float:
+        self.count += 1
+        return float(reward) if self.count < 3 else -float(reward)
+
+
+class Toll(gym.Wrapper[Any, Any, Any, Any]):
+    """Pays for being cut: a wrapper that reads the time limit below it."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward + 0.5 * truncated, terminated, truncated, info
+
+
+class OwnMonitor(gym.RewardWrapper[Any, Any]):
+    """Not SB3's, whatever it is called."""
+
+    def reward(self, reward: Any) -> float:
+        return float(reward) / 2
+
+
+OwnMonitor.__name__ = OwnMonitor.__qualname__ = "Monitor"
+
+
+def grid(**given: Any) -> Any:
+    return gym.make("gridworld:GridWorld-v0", **given)
+
+
+WRAPPED: dict[str, tuple[Callable[[], Any], float]] = {
+    "sticky actions": (lambda: Sticky(grid()), 0.9180564357388),
+    "half the reward": (lambda: wrappers.TransformReward(grid(), lambda r: r / 2), GAMMA**7 / 2),
+    "a stack of frames": (lambda: wrappers.FrameStackObservation(grid(), 2), GAMMA**7),
+    "the time": (lambda: wrappers.TimeAwareObservation(grid(max_episode_steps=20)), GAMMA**7),
+    "a count in a slot": (lambda: Later(wrappers.TimeLimit(Line(), 9)), 0.0),
+    "a toll for being cut": (lambda: Toll(wrappers.TimeLimit(Line(), 5)), 1.5 * GAMMA**4),
+    "a wrapper that is called Monitor": (lambda: OwnMonitor(grid()), GAMMA**7 / 2),
+    "each action twice": (lambda: wrappers.MaxAndSkipObservation(Rooms(5), 2), GAMMA),
+    "SB3's monitor": (lambda: Monitor(Line()), GAMMA**2),
+}
+
+
+@pytest.mark.parametrize("what", WRAPPED)
+def test_wrappers_belong_to_the_world(what: str) -> None:
+    make, truth = WRAPPED[what]
+    assert optimum(make()) == pytest.approx(truth, abs=1e-10)
+
+
+def test_a_toll_is_taken_at_the_limit_of_whoever_waits() -> None:
+    """Without discount, waiting for the cut after five steps pays half."""
+    mdp = gridworld.compile_env(Toll(wrappers.TimeLimit(Line(), 5)))
+    left = np.zeros((mdp.num_states, 2))
+    left[:, 0] = 1
+    score = Evaluator(mdp, 1.0, mdp.max_episode_steps or 5).score(left)
+    assert score.value == 0.5
+
+
+def test_neutral_is_what_runs_a_neutral_step() -> None:
+    assert known.is_neutral(Monitor(Line()))
+    assert not known.is_neutral(OwnMonitor(Line()))
+    assert not known.is_neutral(type("Monitor", (Monitor,), {"step": lambda self, action: None})(Line()))
+    replaced = Monitor(Line())
+    replaced.step = lambda action: None  # type: ignore[assignment, method-assign, return-value]
+    assert not known.is_neutral(replaced)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        grid,
+        lambda: grid(slip=0.2, step_reward=-0.1),
+        lambda: grid(layout="four_rooms"),
+        lambda: grid(layout="cliff"),
+        lambda: gym.make("FrozenLake-v1"),
+        lambda: gym.make("FrozenLake-v1", is_slippery=False),
+        lambda: gym.make("CliffWalking-v1"),
+    ],
+)
+def test_shortcuts_are_what_trying_every_action_finds(make: Callable[[], Any]) -> None:
+    short, slow = gridworld.compile_env(make()), enumerated("env", make()).mdp
+    assert short.max_episode_steps in (slow.max_episode_steps, None)
+    reached = np.flatnonzero(short.reachable & ~short.terminal)
+    outcomes = [
+        [
+            {
+                key: sum(float(p) for p, *other in row if tuple(other) == key)
+                for key in {tuple(other) for p, *other in row if p > 0}
+            }
+            for row in rows_of(mdp, reached)
+        ]
+        for mdp in (short, slow)
+    ]
+    for one, other in zip(*outcomes, strict=True):
+        assert one == pytest.approx(other, abs=1e-15)
+
+
+def rows_of(mdp: Mdp, numbers: Any) -> list[list[tuple[float, int, float, bool]]]:
+    """(probability, number that follows, reward, end) of each of these numbers' states and each action."""
+    states = [int(np.flatnonzero((mdp.number == number) & ~mdp.terminal)[0]) for number in numbers]
+    return [
+        [
+            (float(p), int(mdp.number[t]), float(r), bool(mdp.terminal[t]))
+            for p, t, r in zip(
+                mdp.probability[state, action],
+                mdp.next_state[state, action],
+                mdp.reward[state, action],
+                strict=True,
+            )
+        ]
+        for state in states
+        for action in range(mdp.num_actions)
+    ]
+
+
+# ---- what is asked of it -----------------------------------------------------------------------------------
+
+
+def test_tables_are_by_the_environments_own_numbers() -> None:
+    assert gridworld.evaluate([1] * 5, Middle()).certified
+    assert gridworld.evaluate([0, 0, 1, 1, 1], Middle()).certified  # of other places it may hold anything
+    assert not gridworld.evaluate([1, 1, 0, 1, 1], Middle()).certified
+    with pytest.raises(InputError, match=r"shows Box.*by which no table has rows"):
+        gridworld.evaluate([1] * 5, OneHot())
+    fewer = wrappers.TransformObservation(grid(), lambda state: state // 6, spaces.Discrete(5))
+    with pytest.raises(InputError, match=r"has 30 rows; .* Discrete\(5\)"):
+        gridworld.evaluate([1] * 30, fewer)
+
+
+def test_the_environment_is_left_as_it_was() -> None:
+    env = Sticky(wrappers.TimeLimit(Target(3), 20))
+    env.reset(seed=3)
+    env.action_space.seed(5)
+    env.step(1)
+    layers = [env, env.env, env.unwrapped]
+    before = [(dict(vars(layer)), repr(vars(layer))) for layer in layers]
+    state = env.unwrapped.np_random.bit_generator.state
+    gridworld.compile_env(env)
+    for layer, (held, text) in zip(layers, before, strict=True):
+        assert all(vars(layer)[name] is value for name, value in held.items())
+        assert repr(vars(layer)) == text
+    assert env.unwrapped.np_random.bit_generator.state == state
+
+
+def test_batches_are_one_task_or_refused() -> None:
+    batches = [DummyVecEnv([Middle, Middle]), SyncVectorEnv([Middle, Middle])]
+    for batch in batches:
+        assert optimum(batch) == pytest.approx(GAMMA)
+    with pytest.raises(InputError, match="environment 1 of the DummyVecEnv is a different task"):
+        gridworld.compile_env(DummyVecEnv([lambda: Rooms(4), lambda: Rooms(5)]))
+
+
+class IntOnly(Line):
+    def step(self, action: int) -> Result:
+        return super().step(1 if type(action) is int and action else 0)
+
+
+class Shaped(Line):
+    def step(self, action: int) -> Result:
+        observation, reward, *rest = super().step(action)
+        return observation, np.array([reward]), *rest  # type: ignore[return-value]
+
+
+class OldReset(Line):
+    def reset(self, **given: Any) -> Any:
+        return super().reset(**given)[0]
+
+
+class OldStep(Line):
+    def step(self, action: int) -> Any:
+        observation, reward, over, _, info = super().step(action)
+        return observation, reward, over, info
+
+
+class Endless(Line):
+    def step(self, action: int) -> Result:
+        self.count = getattr(self, "count", 0) + 1
+        return super().step(action)
+
+
+REFUSED: dict[str, tuple[Any, str]] = {
+    "an int that is not an int": (IntOnly, "an action that is an int in another way than np.int64"),
+    "a reward with a shape": (Shaped, r"pays an array of shape \(1,\)"),
+    "a reset of the old Gym": (
+        OldReset,
+        r"reset\(\) returns 0, as in the old Gym: .* must return \(observation",
+    ),
+    "a step of the old Gym": (
+        OldStep,
+        r"step\(\) returns .* as in the old Gym: .* \(observation, reward, termin",
+    ),
+    "a count without end": (Endless, "count"),
+    "no environment": (lambda: 3, "it makes a int; must be a gymnasium.Env"),
+    "a failing constructor": (lambda: 1 / 0, r"cannot make an environment \(ZeroDivisionError"),
+    "nothing at all": (3, "int is no environment"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_is_no_world_is_refused_in_a_sentence(what: str) -> None:
+    env, told = REFUSED[what]
+    with pytest.raises(InputError, match=f"^env: .*{told}") as refused:
+        gridworld.compile_env(env)
+    assert "\n" not in str(refused.value)
+
+
+def test_plain_sb3_on_the_tutorials_world() -> None:
+    """A Dict and a random target, given as an object, in a batch, and to the callback."""
+    venv = DummyVecEnv([lambda: Monitor(wrappers.TimeLimit(Target(2), 20))])
+    callback = gridworld.ExactEvalCallback(wrappers.TimeLimit(Target(2), 20), every=512)
+    model = PPO("MultiInputPolicy", venv, n_steps=256, seed=0, device="cpu")
+    model.learn(1024, callback=callback)
+    score = gridworld.evaluate(model, wrappers.TimeLimit(Target(2), 20))
+    assert score.regret == pytest.approx(float(callback.evaluations["regret"][-1]), abs=1e-12)
+    assert callback.evaluator is not None
+    assert callback.evaluator.optimal_value == pytest.approx(of_target(2), abs=1e-12)
+    env, total = Target(2), 0.0
+    for seed in range(300):
+        observation, _ = env.reset(seed=seed)
+        for step in range(20):
+            action, _ = model.predict(observation, deterministic=True)
+            observation, reward, over, *_ = env.step(action)
+            total += GAMMA**step * float(reward)
+            if over:
+                break
+    assert total / 300 == pytest.approx(score.value, abs=0.1)
