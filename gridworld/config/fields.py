@@ -11,7 +11,7 @@ import functools
 import math
 import re
 from dataclasses import field, fields, is_dataclass
-from enum import Enum, auto
+from enum import Enum, IntEnum, auto
 from typing import Annotated, Any
 
 from gridworld.base.bounds import Bounds, Decay
@@ -29,6 +29,7 @@ LIBRARIES = (  # of classes that an agent is made of
 )
 _OF_LIBRARIES = rf"({'|'.join(map(re.escape, LIBRARIES))})[\w.]+"
 _OF_KEYWORD = r"[\w+-]*"
+_CALLED = "is called with the arguments given, and may write files"
 
 
 class Effect(Enum):
@@ -85,27 +86,43 @@ def declared(schema: type) -> dict[str, dict[str, Any]]:
     return found
 
 
-class Text(Enum):
-    """What a text is: the pattern of those that do no harm, whoever wrote them, and what the others do."""
+class Use(IntEnum):
+    """What is done with settings that a stranger may have written; each does what those before it do, too."""
 
-    WORD = r"(?s).*", "is a word"  # compared, looked up among the program's own, or shown
-    FILE = r"[^\x00]*", "leads out of the current folder"  # nor if it is outside, by links or otherwise
-    CLASS = rf"[^.]*|{_OF_LIBRARIES}", f"is not from one of {', '.join(LIBRARIES)}"
-    CODE = r"\?\?\?", "is called with the arguments given, and may write files"
-    ENV = r"[^:]*", "imports the module before the colon"
+    OPEN = auto()  # the agent is built; the world is the run's own, by its tables
+    REPEAT = auto()  # the agent is trained, with its callbacks
+    RESUME = auto()  # what is logged goes where they say
+    COMPOSE = auto()  # the world is made
+
+
+class Text(Enum):
+    """What a text is: the pattern of those that do no harm, whoever wrote them; what others do, and when."""
+
+    WORD = r"(?s).*", "is a word", Use.OPEN  # compared, looked up among the program's own, or shown
+    CHOICE = r"\w[\w.-]*(/\w[\w.-]*)*", "leads out of the folder of choices", Use.COMPOSE
+    FILE = r"[^\x00]*", "leads out of the current folder", Use.COMPOSE  # nor outside, by links or otherwise
+    CLASS = rf"[^.]*|{_OF_LIBRARIES}", f"is not from one of {', '.join(LIBRARIES)}", Use.OPEN
+    UNKNOWN = r"\?\?\?", _CALLED, Use.OPEN
+    CALLBACK = r"\?\?\?", _CALLED, Use.REPEAT
+    BUILDER = r"\?\?\?", _CALLED, Use.COMPOSE
+    SERVER = r"(?i)false", "contacts a server", Use.RESUME  # a switch
+    ENV = r"[^:]*", "imports the module before the colon", Use.COMPOSE
     ARGUMENTS = (  # of a class of the libraries; a class may be among them, or a rate that falls
         rf"{_OF_KEYWORD}|(lin|sqrt|quad)_[\d.e+-]+|{_OF_LIBRARIES}",
         f"is neither a plain word nor a class of {', '.join(LIBRARIES)}",
+        Use.OPEN,
     )
-    KWARGS = _OF_KEYWORD, "is passed to code that may read it as a file or module"  # not ours
+    KWARGS = _OF_KEYWORD, "is passed to code that may read it as a file or module", Use.COMPOSE  # not ours
 
 
 Word = Annotated[str, Text.WORD]
+ChoiceName = Annotated[str, Text.CHOICE]
 FilePath = Annotated[str, Text.FILE]
 ClassPath = Annotated[str, Text.CLASS]
-CodePath = Annotated[str, Text.CODE]
+BuilderPath = Annotated[str, Text.BUILDER]
 EnvId = Annotated[str, Text.ENV]
-Callback = Annotated[Any, Text.CODE]
+Callback = Annotated[Any, Text.CALLBACK]
+Contact = Annotated[bool, Text.SERVER]
 Arguments = Annotated[dict[str, Any], Text.ARGUMENTS]
 Kwargs = Annotated[dict[str, Any], Text.KWARGS]
 Schedule = int | float | Word

@@ -22,7 +22,7 @@ from gridworld.base.bounds import LARGEST_INTEGER
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import as_text, read_bytes
 from gridworld.base.user_input import users_folder
-from gridworld.config.fields import MISSING
+from gridworld.config.fields import MISSING, Text
 from gridworld.config.settings import check_foreign, foreign, is_file, settings_of_a_run
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import is_override
@@ -33,7 +33,7 @@ IN_A_STUDY = ("experiment", "winner.yaml")
 CHOSEN = ("agent", "env", "observation", "preset", "tuned")
 _LARGEST = 2**16  # bytes
 _DEEPEST = 20  # levels
-_CHOICE = re.compile(r"\w[\w.-]*(/\w[\w.-]*)*")  # no way out of the folder of choices
+_CHOICE = re.compile(Text.CHOICE.value[0])
 # an override
 _WORD = re.compile(r"(?:(~)|(\+{0,2}))(\w+(?:\.\w+)*)(?(1)(?:=.*)?|=(.*))", re.ASCII | re.DOTALL)
 # text as it is
@@ -138,6 +138,8 @@ def _values(content: dict[Any, Any], path: Path, section: str = "") -> Iterator[
     for key, value in content.items():
         name = f"{section}{str(key)[:80]}"
         if name in settings_of_a_run():
+            if name in CHOSEN and not isinstance(value, str):
+                raise InputError(f"{path}: {name}={str(value)[:80]}: must be the name of a choice")
             # What is in no schema has no entry yet that could be changed.
             yield f"{'++' if isinstance(value, dict) else ''}{name}={literal(value, f'{path}: {name}')}"
         elif not any(known.startswith(f"{name}.") for known in settings_of_a_run()):

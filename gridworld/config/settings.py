@@ -28,6 +28,7 @@ from gridworld.config.fields import (
     PRIVILEGE,
     Effect,
     Text,
+    Use,
     WholeNumbers,
     declared,
 )
@@ -176,23 +177,25 @@ def _privileges() -> dict[str, tuple[str, Any]]:
     return {name: metadata[PRIVILEGE] for name, _, metadata in found if PRIVILEGE in metadata}
 
 
-def check_foreign(settings: Mapping[str, Any], where: str, allow: str) -> None:
+def check_foreign(settings: Mapping[str, Any], where: str, allow: str, use: Use = Use.COMPOSE) -> None:
     """Refuse plain values by which a stranger would run code, or have a file read, on the reader's machine.
 
-    `where` they were read, and the word that would `allow` them, are for the message.
+    `use` is made of them. `where` they were read, and the word that would `allow` them, are for the message.
     """
-    for name, value, harm in foreign(settings):
+    for name, value, harm in foreign(settings, use):
         setting = printable(f"{name[:200]}={str(value)[:80]}")
         raise InputError(f"{where}: {setting} {harm}; add {allow} if you trust its author")
 
 
-def foreign(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any, str]]:
+def foreign(settings: Mapping[str, Any], use: Use = Use.COMPOSE) -> Iterator[tuple[str, Any, str]]:
     """Find what does harm if a stranger wrote it, however deep: (dotted name, value, what it does)."""
     for name, value in _leaves(settings, ""):
         for kind in sorted(_texts_at(name), key=lambda kind: kind.name):
-            pattern, harm = kind.value
-            if isinstance(value, str):
-                if re.fullmatch(pattern, value) is None or (kind is Text.FILE and not _is_inside(value)):
+            pattern, harm, begins = kind.value
+            if use < begins:
+                continue
+            if isinstance(value, str) or kind is Text.SERVER:
+                if re.fullmatch(pattern, str(value)) is None or (kind is Text.FILE and not _is_inside(value)):
                     yield name, value, harm
             elif kind is Text.KWARGS and isinstance(value, int | float) and abs(value) > _LARGEST_KWARG:
                 yield name, value, f"is beyond {_LARGEST_KWARG:,}, and may make a world of any size"
@@ -227,7 +230,7 @@ def _texts_at(name: str) -> frozenset[Text]:
     """What a text is at this setting, or around it: code where no schema knows; nothing for a number."""
     while name and name not in _texts():
         name = name.rpartition(".")[0]
-    return _texts().get(name, frozenset([Text.CODE]))
+    return _texts().get(name, frozenset([Text.UNKNOWN]))
 
 
 def is_file(name: str) -> bool:

@@ -22,7 +22,9 @@ from gridworld.config.fields import (
     MISSING,
     RATE,
     Callback,
+    ChoiceName,
     ClassPath,
+    Contact,
     Effect,
     Word,
     affects,
@@ -128,7 +130,8 @@ class LoggingConfig:
     # evaluations between two pictures of the policy; 0 for none
     policy_map_every: int = setting(5, bounds(0))
     progress: bool = setting(True, affects(Effect.NOTHING))
-    wandb: bool = setting(False, affects(Effect.NOTHING))  # log the scalars to W&B as well, while it trains
+    # log the scalars to W&B as well, while it trains
+    wandb: Contact = setting(False, affects(Effect.NOTHING))
 
 
 @dataclass(frozen=True)
@@ -208,7 +211,7 @@ class TrainConfig:
     # the tuned settings of the agent in the world, a file in conf/tuned, that went into this; null: none
     recipe: Word | None = setting(None, affects(Effect.NOTHING))
     # of conf/preset, whose numbers went into this; auto: none was needed (`config.presets`)
-    preset: Word = setting("none", affects(Effect.NOTHING))
+    preset: ChoiceName = setting("none", affects(Effect.NOTHING))
     # what came of these settings when they were tried, where they do not solve the task
     known_failure: Word | None = setting(None, affects(Effect.NOTHING))
     seed: int = setting(0, affects(Effect.SEED), bounds(0, 2**32 - 1))  # of all random numbers

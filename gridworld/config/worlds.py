@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from gridworld.base.bounds import MOST_STEPS, STEP_LIMIT
 from gridworld.base.errors import InputError
-from gridworld.config.fields import MISSING, CodePath, EnvId, FilePath, Kwargs, Word, bounds, setting
+from gridworld.config.fields import MISSING, BuilderPath, EnvId, FilePath, Kwargs, Word, bounds, setting
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
     from gridworld.world.grid import GridMdp
@@ -157,7 +157,7 @@ class BuiltConfig(EnvConfig):
     """What a function returns: an `Mdp`, or the tables of one."""
 
     source: Word = "built"
-    builder: CodePath = MISSING  # the function's import path
+    builder: BuilderPath = MISSING  # the function's import path
     kwargs: Kwargs = field(default_factory=dict)  # of the function
 
     @property

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from gridworld.base.console import command
 from gridworld.base.errors import InputError
+from gridworld.config.fields import Use
 from gridworld.config.settings import check_foreign
 from gridworld.config.train import TrainConfig
 from gridworld.diagnosis.causes import CAUSES, PHRASES
@@ -177,8 +178,7 @@ def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool, offer: TrainCo
         raise InputError(saved.omission)
     if found.offers and not trust:
         config = saved.config if offer is None else offer
-        built = {"agent": dataclasses.asdict(config.agent), "callbacks": config.callbacks}
-        check_foreign(built, str(saved.run.manifest_file), "--trust")
+        check_foreign(dataclasses.asdict(config), str(saved.run.manifest_file), "--trust", Use.RESUME)
 
 
 def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> NDArray[np.uint8]:

@@ -345,6 +345,7 @@ def train(runs: Sequence[Run], states: Sequence[State | None]) -> None:
             try:
                 with fitting():
                     type(run.population)([run], [state])
+                run.model._current_progress_remaining = 1 - run.population.progress(run)
             except StateError as error:
                 run.fail(error)
                 continue

@@ -37,6 +37,7 @@ from gridworld.base.console import command, printable
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import users_folder
 from gridworld.config import train as schema
+from gridworld.config.fields import Use
 from gridworld.config.settings import foreign
 
 MANIFEST = "manifest.json"
@@ -88,8 +89,7 @@ class RunFolder:
 
     def resume_command(self, trusted: Mapping[str, Any] | None = None) -> str:
         """The command line that resumes the run; for settings that the user has `trusted`, it says so."""
-        parts = {key: (trusted or {}).get(key) for key in ("agent", "callbacks")}  # that are built again
-        trust = " trust=true" if any(foreign(parts)) else ""
+        trust = " trust=true" if any(foreign(trusted or {}, Use.RESUME)) else ""
         place = Path(os.path.normpath(users_folder() / self.folder))  # `resume` refuses ../runs/mine
         return f"{command('train')} resume={shell_path(place)}{trust}"
 

@@ -20,7 +20,7 @@ from gridworld.base.console import printable, tell, telling_if_slow
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import open_ordinary
 from gridworld.base.serialization import State, StateError
-from gridworld.config.fields import falls
+from gridworld.config.fields import Use, falls
 from gridworld.config.settings import flat, foreign
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig
@@ -45,7 +45,7 @@ _NAMED = 3  # settings that differ
 def open_unfinished(folder: Path, trust: bool = False) -> Unfinished:
     """Read a run that is to be resumed; `trust` imports its settings' classes, wherever they are from."""
     run = read_run(folder)
-    config = settings_of(run, trust, allow="trust=true")
+    config = settings_of(run, trust, Use.RESUME, "trust=true")
     return Unfinished(run, config, stored_world(run, config.env), trust)
 
 

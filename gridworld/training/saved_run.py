@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from gridworld.agents import Agent
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import DAMAGED, limited
+from gridworld.config.fields import Use
 from gridworld.config.settings import check_foreign, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.words import own_conf_folders
@@ -50,7 +51,7 @@ class SavedRun:
         self._model_file = self.run.best_model_file if best else self.run.model_file
         self._steps = "best_step" if best else "timesteps"
         # The device that it was trained on need not exist here.
-        self.config = dataclasses.replace(settings_of(self.run, trust, trains=False), device="cpu")
+        self.config = dataclasses.replace(settings_of(self.run, trust, Use.OPEN), device="cpu")
         self.mdp: Mdp = stored_world(self.run, self.config.env)
         self._trust = trust
 
@@ -65,8 +66,8 @@ class SavedRun:
     @property
     def omission(self) -> str:
         """A sentence on what `overrides` leaves out; "" for nothing."""
-        what = f"{shown(self.run.folder)}: its command line may run code or read files outside this folder; "
-        return f"{what}diagnose it with --trust (trust=True) to see what to try" if self._words[1] else ""
+        what = f"{shown(self.run.folder)}: its command line may run code, read other files or contact servers"
+        return f"{what}; diagnose it with --trust (trust=True) to see what to try" if self._words[1] else ""
 
     @cached_property
     def _words(self) -> tuple[list[str], bool]:
@@ -128,9 +129,9 @@ class SavedRun:
 
 
 def settings_of(
-    run: RunReader, trust: bool = False, trains: bool = True, allow: str = "--trust"
+    run: RunReader, trust: bool = False, use: Use = Use.REPEAT, allow: str = "--trust"
 ) -> TrainConfig:
-    """Read the settings in a run's manifest; where it `trains`, its callbacks are called too.
+    """Read the settings in a run's manifest, for this `use` of them.
 
     `allow` is the word by which the command's user says that the run is trusted.
     """
@@ -141,9 +142,7 @@ def settings_of(
     try:
         check(config)
         if not trust:
-            callbacks = config.callbacks if trains else []
-            used = {"agent": dataclasses.asdict(config.agent), "callbacks": callbacks}
-            check_foreign(used, str(run.manifest_file), allow)
+            check_foreign(dataclasses.asdict(config), str(run.manifest_file), allow, use)
         config.agent.check(config)
     except RecursionError:
         raise InputError(f"{run.manifest_file}: config is nested too deeply") from None

@@ -59,13 +59,13 @@ def stopped_after(number: int, folder: Path, *overrides: str) -> None:
         begin(folder, *overrides)
 
 
+def crash(*arguments: object) -> None:
+    raise Crash
+
+
 @contextlib.contextmanager
 def crashing_after(number: int) -> Iterator[None]:
     """The same of whatever is done in here."""
-
-    def crash() -> None:
-        raise Crash
-
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(Checkpoints, "save", at_call(number, crash, Checkpoints.save, after=True))
         with pytest.raises(Crash):
@@ -118,6 +118,7 @@ def left_behind(folder: Path) -> dict[str, Any]:
             found[name] = path.read_bytes()
     summary = json.loads((folder / "summary.json").read_text())
     found["summary"] = {key: value for key, value in summary.items() if key not in OF_THE_CLOCK}
+    found["model"] = weights((folder / "model.zip").read_bytes(), folder)
     found["best model"] = weights((folder / "best_model.zip").read_bytes(), folder)
     found["points"] = points(folder)
     found["state"] = last_state(folder)

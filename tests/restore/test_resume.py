@@ -4,21 +4,25 @@ More kills: GRIDWORLD_RUN_KILLS=1000 GRIDWORLD_POINT_KILLS=3 python -m pytest te
 """
 
 import gc
+import json
 import os
 import random
 import shutil
 import signal
 import sys
 import time
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from helpers.resuming import (
+    Crash,
     at_call,
     begin,
     begin_or_go_on,
+    crash,
     crashing_after,
     differences,
     go_on,
@@ -62,6 +66,14 @@ CASES = {
         *(*SHORT["ppo"], "agent.engine=stock", "agent.log_interval=2", "n_envs=8"),
         "total_timesteps=1200",
     ],
+    "ppo stock with settings that fall": [
+        *(*SHORT["ppo"], "agent.engine=stock", "agent.ent_coef=quad_0.5", "agent.gae_lambda=lin_0.5"),
+        *("agent.learning_rate=sqrt_0.01", "agent.clip_range=lin_0.3"),
+    ],
+    "dqn stock with a rate that falls": [
+        *(*SHORT["dqn"], "agent.engine=stock", "agent.learning_rate=sqrt_0.01", "n_envs=8"),
+        *("agent.gradient_steps=1", "total_timesteps=800"),
+    ],
     **{f"{name} stock": [*SHORT[name], "agent.engine=stock"] for name in ("a2c", "qrdqn", "trpo")},
     **{name: SHORT[name] for name in ("a2c", "qrdqn", "trpo", "q_learning", "sarsa", "expected_sarsa")},
 }
@@ -77,6 +89,34 @@ def test_every_agent_goes_on_to_the_bit(case: str, tmp_path: Path) -> None:
     with crashing_after(2):
         go_on(tmp_path / "run")
     go_on(tmp_path / "run")
+    assert differences(left_behind(tmp_path / "run"), left_behind(tmp_path / "calm")) == []
+
+
+def members(path: Path) -> dict[str, Any]:
+    """Everything in a model file, except the time when it began, and what is pickled, by its text alone."""
+    with zipfile.ZipFile(path) as archive:
+        found: dict[str, Any] = {name: archive.read(name) for name in archive.namelist()}
+    if "data" in found:
+        found["data"] = json.loads(found["data"])
+        del found["data"]["start_time"]
+        for value in found["data"].values():
+            if isinstance(value, dict):
+                value.pop(":serialized:", None)
+    return found
+
+
+@pytest.mark.parametrize("case", [*CASES, "value_iteration"])
+def test_a_run_that_dies_after_its_last_checkpoint_writes_the_same_model(case: str, tmp_path: Path) -> None:
+    """Whatever is in the file: the optimiser's rate, what is left of training, counters."""
+    words = [*CASES.get(case, SHORT["value_iteration"]), "recording.frames=false", "recording.gif=false"]
+    begin(tmp_path / "calm", *words)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(session.Session, "_finish", crash)
+        with pytest.raises(Crash):
+            begin(tmp_path / "run", *words)
+    go_on(tmp_path / "run")
+    for name in ("model.zip", "best_model.zip"):
+        assert differences(members(tmp_path / "run" / name), members(tmp_path / "calm" / name)) == [], name
     assert differences(left_behind(tmp_path / "run"), left_behind(tmp_path / "calm")) == []
 
 

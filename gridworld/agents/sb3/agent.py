@@ -174,7 +174,7 @@ class SB3Agent(Agent):
 
     def model_file(self) -> bytes:
         content = io.BytesIO()
-        self._model.save(content)
+        self._model.save(content, exclude=["_last_original_obs"])  # which SB3 sets before it reads it
         return content.getvalue()
 
     def load(self, path: Path) -> None:
@@ -186,7 +186,7 @@ class SB3Agent(Agent):
         }
         size = sum(weights.nbytes for state in own.values() for weights in state.values())
         kind = f"a model of {self.config.name}"
-        found, rate = read_model(path, _SPARE_BYTES + _BYTES_A_BYTE * size, kind)
+        found, numbers = read_model(path, _SPARE_BYTES + _BYTES_A_BYTE * size, kind)
         for module in own:
             arrays, expected = (
                 {name: tensor.cpu().numpy() for name, tensor in of_all.get(module, {}).items()}
@@ -197,7 +197,7 @@ class SB3Agent(Agent):
         taken: Any = {module: found[module] for module in own}
         self._model.set_parameters(taken, exact_match=False, device=self._model.device)
         self._loaded = True
-        if rate is not None:
+        if (rate := numbers.get("exploration_rate")) is not None:
             Bounds(0, 1).check(f"{path}: exploration_rate", rate)
             self._model.exploration_rate = rate  # type: ignore[attr-defined]
 

@@ -70,12 +70,12 @@ class RunCallback(CallbackList):
         others: Sequence[BaseCallback],
         falling: dict[str, Decay],
     ) -> None:
-        schedules = [
+        self._schedules = [
             FallingSetting(name, decay.initial, decay.power)
             for name, decay in falling.items()
             if not (name in SCHEDULES and decay.power == 1)
         ]
-        super().__init__([*schedules, *others])
+        super().__init__([*self._schedules, *others])
         self._hook, self._on_safe_point, self._state = on_step, on_safe_point, state
         self._log_interval, self._others = log_interval, others
         self._continues = True
@@ -95,6 +95,8 @@ class RunCallback(CallbackList):
         if self._state is not None:
             with fitting():
                 set_state(self.model, self._others, self._state)
+            for each in self._schedules:
+                each.put_back()
             self._state = None
             self.num_timesteps = self.model.num_timesteps
 
@@ -150,15 +152,26 @@ class FallingSetting(BaseCallback):
             self._set()
 
     def _set(self) -> None:
+        value = self._set_as_after(self.model.num_timesteps)
+        if self._name != "learning_rate":  # which SB3 logs
+            self.logger.record(f"train/{self._name}", value)
+
+    def put_back(self) -> None:
+        """Set it as the last rollout before a checkpoint did."""
         model: Any = self.model
-        value = self._decay.at(min(model.num_timesteps / model._total_timesteps, 1.0))
+        rollout = model.n_steps * model.n_envs if self._name == "gae_lambda" else 0
+        self._set_as_after(model.num_timesteps - rollout)
+
+    def _set_as_after(self, steps: int) -> float:
+        model: Any = self.model
+        value = self._decay.at(min(steps / model._total_timesteps, 1.0))
         if self._name == "learning_rate":  # SB3's own, so that its `load` reads the model's file anywhere
             model.lr_schedule = FloatSchedule(value)
-            return
-        setattr(model, self._name, value)
+        else:
+            setattr(model, self._name, value)
         if self._name == "gae_lambda":
             model.rollout_buffer.gae_lambda = value
-        model.logger.record(f"train/{self._name}", value)
+        return value
 
 
 def _path(thing: object) -> str:

@@ -1,7 +1,7 @@
 """Reading a model file of Stable-Baselines3 as data, without unpickling.
 
 The file is a zip. Its `.pth` members are torch's own files: a zip again, with a pickle that names tensors and
-a member for each tensor's numbers. Of the member `data`, which SB3's `load` unpickles, one number is searched
+a member for each tensor's numbers. Of the member `data`, which SB3's `load` unpickles, numbers are searched
 as text. torch's `weights_only` alone would let a file ask for any amount of memory, so only those pickles are
 read that name what a dictionary of tensors needs. SB3 and torch compress nothing: nothing grows in reading.
 """
@@ -9,12 +9,14 @@ read that name what a dictionary of tensors needs. SB3 and torch compress nothin
 from __future__ import annotations
 
 import io
+import itertools
 import pickletools
 import re
 import zipfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -33,11 +35,12 @@ _NAMED = re.compile(
     r"|torch\.nn\.parameter Parameter"
 )
 _NAMING = ("GLOBAL", "STACK_GLOBAL", "INST", "EXT1", "EXT2", "EXT4")
-_RATE = re.compile(rb'^    "exploration_rate": ([0-9.eE+-]+),?$', re.MULTILINE)  # as SB3 indents it
+_NUMBERS = re.compile(rb'^    "(\w+)": ([0-9.eE+-]+),?$', re.MULTILINE)  # as SB3 indents its own
+_MOST_NUMBERS, _CLOCK = 1000, "start_time"
 
 
-def read_model(path: Path, most: int, kind: str = "a model") -> tuple[Parameters, float | None]:
-    """Read a model file of at most `most` bytes: the tensors by module, and DQN's exploration rate.
+def read_model(path: Path, most: int, kind: str = "a model") -> tuple[Parameters, dict[str, float]]:
+    """Read a model file of at most `most` bytes: the tensors by module, and the model's own numbers by name.
 
     Raises:
         InputError: the file may not be opened, or is not `kind`.
@@ -45,18 +48,19 @@ def read_model(path: Path, most: int, kind: str = "a model") -> tuple[Parameters
     content = read_bytes(path, most, copies=5)  # beside it its members, theirs, and the tensors
     try:
         members = _members(content)
-        rate = _RATE.search(members.get("data", b""))
+        found = itertools.islice(_NUMBERS.finditer(members.get("data", b"")), _MOST_NUMBERS)
         modules = [name for name in members if name.endswith(".pth") and name != _VARIABLES]
         parameters = {name.removesuffix(".pth"): _flat(load_tensors(members[name])) for name in modules}
-        return parameters, None if rate is None else float(rate.group(1))
+        return parameters, {each[1].decode(): float(each[2]) for each in found}
     except Exception as error:  # zipfile and torch, each in their way
         raise InputError(f"{path}: not {kind} that can be read ({in_short(error)})") from None
 
 
 def read_weights(path: Path, most: int) -> dict[str, NDArray[Any]]:
-    """See `gridworld.agents.Family.weights`; the optimiser's tensors are among them."""
-    parameters, _ = read_model(path, most)
-    return {
+    """See `gridworld.agents.Family.weights`; the optimiser's and the model's own numbers are among them."""
+    parameters, numbers = read_model(path, most)
+    own = {f"data.{name}": np.array(number) for name, number in numbers.items() if name != _CLOCK}
+    return own | {
         f"{module}.{name}": tensor.numpy()
         for module, tensors in parameters.items()
         for name, tensor in tensors.items()
@@ -86,7 +90,9 @@ def load_tensors(content: bytes) -> dict[str, Any]:
 
 
 def _flat(found: dict[str, Any]) -> dict[str, Tensor]:
-    if "param_groups" in found:  # an optimiser's numbers of each weight, which are counted
-        numbers = found["state"].items()
-        found = {f"{place}.{name}": value for place, own in numbers for name, value in own.items()}
+    if "param_groups" in found:  # an optimiser's numbers of each weight, which are counted, and its settings
+        parts = found["state"] | {f"group {number}": own for number, own in enumerate(found["param_groups"])}
+        found = {f"{place}.{name}": value for place, own in parts.items() for name, value in own.items()}
+        plain = {name: value for name, value in found.items() if isinstance(value, int | float)}
+        found |= {name: torch.tensor(value, dtype=torch.float64) for name, value in plain.items()}
     return {str(name): value.detach() for name, value in found.items() if isinstance(value, Tensor)}
