@@ -3,7 +3,8 @@
 It prints what has changed since then: commit and uncommitted changes, versions, processor, environment
 variables. Then it trains again in a temporary folder and compares the learning curve, final weights, visits,
 summary and TensorBoard points. A lengthened run is lengthened again; a run whose numbers depend on other runs
-of its sweep is trained together with them. Exit code: 0 if everything is identical, 1 if not, 2 if undecided.
+of its sweep is trained together with them. Repeated after a kill, a command with --keep continues its run.
+Exit code: 0 if everything is identical, 1 if not, 2 if undecided.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from gridworld.base.console import printable, telling_if_slow
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import limited
 from gridworld.commands import parser_of
-from gridworld.run.folder import MANIFEST, check_inside
+from gridworld.run.folder import check_inside, claimed
 from gridworld.run.provenance import describe, differences, source_differences
-from gridworld.run.reader import RunReader, check_free, open_run, read_run, stored_world
+from gridworld.run.reader import RunReader, check_free, find_run, open_run, read_run, stored_world
 from gridworld.training.reproduce import check_whole, compare, lengths, population, repeat
 from gridworld.training.saved_run import settings_of
 from gridworld.training.setup import without_pictures
@@ -52,14 +53,17 @@ def main(arguments: Sequence[str]) -> None:
     if members:
         names = ", ".join(run.folder.name for run in members)
         print(f"  its numbers depend on all runs of its population, which train again: {names}", flush=True)
-    with tempfile.TemporaryDirectory(prefix="gridworld-") as temporary:
-        folder = options.keep or Path(temporary)
-        folder.mkdir(parents=True, exist_ok=True)
+    with (
+        tempfile.TemporaryDirectory(prefix="gridworld-") as temporary,
+        claimed(folder := options.keep or Path(temporary) / "again"),
+    ):
+        before = find_run(folder)
         again = config if options.keep is not None else without_pictures(config)
         try:
             repeat(then, folder, again, mdp, options.trust, members)
         except InputError as error:
-            if not (folder / MANIFEST).exists():  # these settings cannot be run here at all
+            now = find_run(folder)
+            if now is None or (before and now.manifest == before.manifest):  # nothing was trained
                 raise
             print(f"  it did not finish this time: {printable(str(error))}\ndifferent")
             sys.exit(DIFFERENT)

@@ -29,9 +29,16 @@ from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.run.folder import EVENTS, MANIFEST
 from gridworld.run.provenance import settings_hash
-from gridworld.run.reader import LARGEST_RESULT, NUMBERS_DEPEND_ON, RunReader, read_run, stored_world
+from gridworld.run.reader import (
+    LARGEST_RESULT,
+    NUMBERS_DEPEND_ON,
+    RunReader,
+    find_run,
+    read_run,
+    stored_world,
+)
 from gridworld.run.summary import Summary
-from gridworld.training.resume import open_unfinished
+from gridworld.training.resume import open_unfinished, unfinished_of
 from gridworld.training.saved_run import read_visits, settings_of
 from gridworld.training.session import CLOCK
 from gridworld.training.setup import without_pictures
@@ -118,15 +125,26 @@ def repeat(
 ) -> None:
     """Train a run again in `folder`, which exists, with the members of its `population` elsewhere.
 
-    `trust` imports the classes that its settings name, wherever they are from. It is an `InputError` if it
-    cannot be trained here.
+    An unfinished run of the same settings in it is continued. `trust` imports the classes that its settings
+    name, wherever they are from. It is an `InputError` if it cannot be trained here.
     """
     first, *longer = lengths(then, config)
     overrides = then.manifest.get("overrides") or []
     logging = dataclasses.replace(config.logging, wandb=False)
     config = dataclasses.replace(config, total_timesteps=first, logging=logging)
     own = training(config, folder, overrides, lambda env: mdp)
-    if not members:
+    if begun := find_run(folder):
+        if members:
+            raise InputError(
+                f"{folder}: contains an unfinished run, whose numbers depend on other runs, so it cannot be "
+                "continued; choose another folder"
+            )
+        reached = begun.manifest["config"].get("total_timesteps")
+        if reached in longer:
+            first, longer = reached, longer[longer.index(reached) + 1 :]
+        same = dataclasses.replace(config, total_timesteps=first)
+        unfinished_of(folder, same, lambda env: mdp, trust).resume()
+    elif not members:
         run_alone(own)
     else:
         place = [run.folder.name for run in members].index(then.folder.resolve().name)

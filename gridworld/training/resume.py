@@ -23,7 +23,7 @@ from gridworld.base.serialization import State, StateError
 from gridworld.config.fields import Use, falls
 from gridworld.config.settings import flat, foreign
 from gridworld.config.train import TrainConfig
-from gridworld.config.worlds import MapConfig
+from gridworld.config.worlds import EnvConfig, MapConfig, compiled
 from gridworld.run.checkpoints import MOST_STEPS, Checkpoints, steps_of
 from gridworld.run.folder import CHECKPOINTS, CURVE
 from gridworld.run.provenance import environment, git, identity, settings, source_differences
@@ -49,9 +49,11 @@ def open_unfinished(folder: Path, trust: bool = False) -> Unfinished:
     return Unfinished(run, config, stored_world(run, config.env), trust)
 
 
-def unfinished_of(folder: Path, config: TrainConfig) -> Unfinished:
+def unfinished_of(
+    folder: Path, config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled, trust: bool = True
+) -> Unfinished:
     """Read the unfinished run of these settings, to resume it with them; refused if its own differ."""
-    unfinished = open_unfinished(folder, trust=True)  # its classes are those of `config`, or it is refused
+    unfinished = open_unfinished(folder, trust)  # its classes are those of `config`, or it is refused
     if unfinished.run.is_finished:
         raise InputError(f"{folder}: contains a run already; choose another folder")
     own, given = (
@@ -60,7 +62,7 @@ def unfinished_of(folder: Path, config: TrainConfig) -> Unfinished:
     )
     keys = [key for key in dict.fromkeys([*own, *given]) if own.get(key) != given.get(key)]
     differing = [f"{key}={given.get(key)} instead of {own.get(key)}" for key in keys]
-    if check_settings(config).text() != unfinished.mdp.text() and not differing:
+    if check_settings(config, world).text() != unfinished.mdp.text() and not differing:
         differing = [f"the world {config.env.name} has changed"]
     if differing:
         more = f" and {len(differing) - _NAMED} more" if len(differing) > _NAMED else ""

@@ -14,16 +14,22 @@ import numpy as np
 import pytest
 from helpers.hostile import manifest, seal, weights
 from helpers.own_class import OWN_CLASS, any_class
-from helpers.resuming import go_on, stopped_after
+from helpers.resuming import at_call, go_on, in_a_process, kill, stopped_after
 from helpers.support import ROOT, SHORT, script, train_in
 
 from gridworld.base.errors import InputError
 from gridworld.base.signals import exiting
 from gridworld.commands import reproduce as command
 from gridworld.commands.reproduce import main
-from gridworld.run.folder import SOURCE_DIFF
+from gridworld.config.train import TrainConfig
+from gridworld.run.checkpoints import Checkpoints
+from gridworld.run.folder import SOURCE_DIFF, alone_in
 from gridworld.run.provenance import describe, differences, source_of
+from gridworld.run.reader import read_run
+from gridworld.training.reproduce import compare
+from gridworld.training.saved_run import SavedRun
 from gridworld.training.tensorboard import EventWriter, read_scalars
+from gridworld.world.mdp import Mdp
 
 PARTS = ["learning curve", "final weights", "best weights", "visits", "summary", "TensorBoard points"]
 PLAIN = ["recording.frames=false", "recording.gif=false", "env.slip=0.1", "seed=3"]
@@ -147,7 +153,7 @@ def test_what_differs_in_the_environment_is_told_and_the_run_is_kept_where_it_is
     assert not list(differences(describe(), describe()))
 
     names = [{path.name for path in run.iterdir() if "tfevents" not in path.name} for run in (kept, copy)]
-    assert names[0] == names[1]
+    assert names[0] == names[1] | {".lock"}
     assert (kept / "policy.png").read_bytes() == (copy / "policy.png").read_bytes()
     with pytest.raises(InputError, match="contains a run already"):
         reproduce(copy, capsys, "--keep", str(kept))
@@ -167,6 +173,66 @@ def test_a_run_that_was_interrupted_and_made_longer_is_made_longer_again(
     shown = reproduce(folder, capsys)
     assert "  made longer: to 1,000, 1,500 steps first, then on to 2,500\n" in shown
     assert verdicts(shown) == dict.fromkeys(PARTS, "identical") | {"environment": "the same"}
+
+
+def test_a_reproduction_that_is_killed_is_continued_by_the_same_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed before each second checkpoint, at the first length and the later one."""
+    folder, kept = tmp_path / "run", tmp_path / "kept"
+    train_in(folder, *SHORT["dqn"], *PLAIN, "total_timesteps=1000", "checkpoint.every=300")
+    go_on(folder, 1600)
+
+    def killed() -> None:
+        monkeypatch.setattr(Checkpoints, "save", at_call(2, kill, Checkpoints.save))
+        main([str(folder), "--keep", str(kept)])
+
+    lengths = []
+    while in_a_process(killed) == -signal.SIGKILL:
+        content = json.loads((kept / "manifest.json").read_text())
+        assert content["status"] == "running"
+        lengths.append(content["config"]["total_timesteps"])
+    assert sorted(set(lengths)) == [1000, 1600]
+    with pytest.raises(InputError, match="kept: contains a run already"):
+        main([str(folder), "--keep", str(kept)])
+    found = {finding.part: finding.same for finding in compare(*map(read_run, (folder, kept)), *of(folder))}
+    assert found == dict.fromkeys(PARTS, True)
+
+
+def of(folder: Path) -> tuple[TrainConfig, Mdp]:
+    saved = SavedRun(folder)
+    return saved.config, saved.mdp
+
+
+def test_an_unfinished_reproduction_that_cannot_be_continued_gets_no_verdict(
+    copy: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = copy.with_name("kept")
+
+    def killed() -> None:
+        monkeypatch.setattr(Checkpoints, "save", at_call(1, kill, Checkpoints.save, after=True))
+        main([str(copy), "--keep", str(kept)])
+
+    assert in_a_process(killed) == -signal.SIGKILL
+    before = (kept / "manifest.json").read_bytes()
+
+    def refused(told: str) -> None:
+        capsys.readouterr()
+        with pytest.raises(InputError, match=told):
+            main([str(copy), "--keep", str(kept)])
+        assert "different" not in capsys.readouterr().out
+        assert (kept / "manifest.json").read_bytes() == before
+
+    with monkeypatch.context() as patched:
+        patched.setattr("gridworld.training.resume.environment", lambda agent: {"torch": "1.0"})
+        refused("kept: was started in another environment .*torch")
+    with monkeypatch.context() as patched:
+        patched.setattr(command, "population", lambda then: [then])
+        refused("kept: contains an unfinished run, whose numbers depend on other runs")
+    with alone_in(kept):
+        refused("kept: another process is using it")
+    manifest(copy, lambda content: content["config"].update(seed=4))
+    refused("kept: contains an unfinished run with other settings .*seed=4 instead of 3")
 
 
 @pytest.mark.parametrize(

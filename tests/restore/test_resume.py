@@ -3,16 +3,13 @@
 More kills: GRIDWORLD_RUN_KILLS=1000 GRIDWORLD_POINT_KILLS=3 python -m pytest tests/restore/test_resume.py
 """
 
-import gc
 import json
 import os
 import random
 import shutil
 import signal
-import sys
 import time
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +23,8 @@ from helpers.resuming import (
     crashing_after,
     differences,
     go_on,
+    in_a_process,
+    kill,
     left_behind,
     stopped_after,
 )
@@ -124,27 +123,6 @@ SAVED = ["recording.frames=false", "recording.gif=false", "logging.progress=fals
 RUNS = {name: [*CASES[name], *SAVED] for name in ("dqn", "dqn stock", "ppo", "q_learning")}
 
 
-def in_a_process(work: Callable[[], None], seconds: float | None = None) -> int:
-    """What became of a process of its own, killed after so long: 0 it ended well, below 0 it was killed."""
-    process = os.fork()
-    if process == 0:
-        try:
-            gc.disable()
-            with open(os.devnull, "w") as nowhere:
-                sys.stderr = nowhere
-                work()
-            os._exit(0)
-        except BaseException:
-            import traceback
-
-            traceback.print_exc(file=sys.__stderr__)
-            os._exit(1)
-    if seconds is not None:
-        time.sleep(seconds)
-        os.kill(process, signal.SIGKILL)
-    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
-
-
 def is_done(folder: Path) -> bool:
     manifest = folder / "manifest.json"
     return manifest.exists() and '"status": "finished"' in manifest.read_text()
@@ -171,10 +149,6 @@ def test_a_run_that_is_killed_ends_as_if_it_was_not(name: str, tmp_path: Path) -
         assert in_a_process(lambda: begin_or_go_on(folder, *words)) == 0
         assert differences(left_behind(folder), calm) == []
         assert list(folder.rglob(".*.part")) == []
-
-
-def kill() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 # Where to die: before or after this function's n-th call.
