@@ -2,7 +2,7 @@
 
 RUNS are folders of runs or sweeps, or any above them. Nothing is uploaded by default: W&B writes offline runs
 (unless WANDB_MODE is set), MLflow a local database (unless MLFLOW_TRACKING_URI is set). Runs exported before
-are skipped. Exit code: 0 if every run is exported, 1 if some are not, 2 if none is.
+are skipped. Exit code: 0 if every run is exported whole, 1 if some are not, or lack a file, 2 if none is.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from gridworld.commands import parser_of
 from gridworld.report.evidence import find_runs
 from gridworld.report.export.exported_run import read
 from gridworld.report.export.targets import TARGETS, check_installed
-from gridworld.run.folder import check_inside, check_writable
+from gridworld.run.folder import alone_in, check_inside, check_writable
+
+_LONGEST_WAIT = 600.0  # seconds for another export to the same folder
 
 
 @limited()
@@ -40,7 +42,8 @@ def main(arguments: Sequence[str]) -> None:
     with telling_if_slow("exporting the runs"):
         for folder in folders:
             try:
-                place = _export(folder, options.to, out, options.project)
+                place, damage = _export(folder, options.to, out, options.project)
+                problems += damage
                 print(printable(f"{folder}: {place}"), flush=True)
             except InputError as error:
                 problems.append(str(error))
@@ -55,12 +58,14 @@ def main(arguments: Sequence[str]) -> None:
         sys.exit(1)
 
 
-def _export(folder: Path, to: str, out: Path, project: str) -> str:
+def _export(folder: Path, to: str, out: Path, project: str) -> tuple[str, tuple[str, ...]]:
+    """Where the run is now, and a sentence for each of its files that it lacks there."""
     with TemporaryDirectory(prefix="gridworld-") as copies:
         run = read(folder, Path(copies))
         out.mkdir(parents=True, exist_ok=True)
         try:
-            return TARGETS[to].write(run, out, project)
+            with alone_in(out, _LONGEST_WAIT):  # two at once would make one database, or remove each other's
+                return TARGETS[to].write(run, out, project), run.evidence.damage
         except (InputError, OSError):
             raise
         except Exception as error:  # of packages that are not ours

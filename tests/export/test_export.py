@@ -1,11 +1,13 @@
 """Exports of runs, read back as the programs that they are for read them. No network is used."""
 
+import contextlib
 import csv
 import dataclasses
 import json
 import os
 import re
 import shutil
+import sqlite3
 import struct
 import subprocess
 import sys
@@ -241,11 +243,77 @@ def test_hub(place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
 
 
 def test_another_run_of_that_name_gets_a_folder_of_its_own(place: Path) -> None:
+    """Which is no proof that the run is in it."""
     (place / "other" / NAME).mkdir(parents=True)
-    done = script("export.py", "runs/dqn", "--to", "hub", "--out", "other", cwd=place)
+    for _ in range(2):
+        done = script("export.py", "runs/dqn", "--to", "hub", "--out", "other", cwd=place)
+        assert done.returncode == 0, done.stderr
+        [folder] = re.findall(rf"^runs/dqn: (other/{NAME}-[0-9a-f]{{16}})\n", done.stdout)
+        assert not list((place / "other" / NAME).iterdir())
+        assert (place / folder / "results.json").exists()
+        shutil.rmtree(place / folder)
+        (place / folder).mkdir()
+
+
+KILLED_IN = {  # functions, in the order in which an export calls them
+    "wandb": ["wandb.Image", "wandb.Run.log", "wandb.Artifact.add_file", "wandb.Run._finish"],
+    "mlflow": [
+        *("mlflow.store.db.utils._upgrade_db", "mlflow.MlflowClient.create_experiment"),
+        *("mlflow.MlflowClient.log_batch", "mlflow.MlflowClient.log_artifact"),
+        "mlflow.MlflowClient.set_terminated",
+    ],
+    "hub": [f"gridworld.report.export.targets.{each}" for each in ("write_text", "write_json")],
+}
+
+
+@pytest.mark.parametrize("to", ["wandb", pytest.param("mlflow", marks=pytest.mark.slow), "hub"])
+def test_an_export_that_is_killed_is_whole_after_the_same_command(to: str, place: Path) -> None:
+    """Killed in each of these functions, one export after the other."""
+    program = f"""if True:
+        import os, signal
+        from unittest import mock
+        from gridworld.commands.export import main
+        from gridworld.report.export.targets import TARGETS
+        for package in TARGETS[{to!r}].packages:
+            __import__(package)
+
+        def kill(*arguments, **options):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        def export(function, *words):
+            child = os.fork()
+            if child == 0:
+                with mock.patch(function, kill) if function else mock.MagicMock():
+                    main(["runs/dqn", "--to", {to!r}, *words])
+                os._exit(0)
+            return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+        for function in {KILLED_IN[to]}:
+            assert export(function, "--out", "killed") == -signal.SIGKILL, function
+        for words in (["--out", "killed"], ["--out", "killed"], ["--out", "calm"]):
+            assert export("", *words) == 0
+    """
+    folder = place / f"kills-{to}"
+    folder.mkdir()
+    (folder / "runs").symlink_to(place / "runs")
+    command = [sys.executable, "-W", "ignore", "-c", program]
+    environment = {**os.environ, "HOME": str(folder)}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert re.match(rf"runs/dqn: other/{NAME}-[0-9a-f]{{16}}\n", done.stdout)
-    assert not list((place / "other" / NAME).iterdir())
+    assert written(folder / "killed") == written(folder / "calm")
+
+
+def written(out: Path) -> list[tuple[str, int]]:
+    """The files of an export without what no two have in common, with their sizes, and MLflow's rows."""
+    ids = r"offline-run-\w+-(?=\w+/)|(?<=artifacts/)\w{32}|logs/.*|.*\.(lock|log|db|wandb)$|latest-run.*"
+    files = [path for path in sorted(out.rglob("*")) if path.is_file()]
+    found = [(re.sub(ids, "", str(path.relative_to(out))), path.stat().st_size) for path in files]
+    if (out / "mlflow.db").exists():
+        with contextlib.closing(sqlite3.connect(out / "mlflow.db")) as database:
+            for table in ("experiments", "runs where status = 'FINISHED'", "runs", "params", "metrics"):
+                [(rows,)] = database.execute(f"select count(*) from {table}")
+                found.append((table, rows))
+    return sorted((name, size) for name, size in found if name)
 
 
 @pytest.fixture(scope="module")
@@ -291,6 +359,26 @@ def test_only_what_the_manifest_vouches_for_is_exported(lake: Path, tmp_path: Pa
     del manifest["sha256"]["episode.gif"]
     (run / "manifest.json").write_text(json.dumps(sealed(manifest)))
     assert found.keys() - as_read(run, tmp_path / "without").keys() == {"episode.gif"}
+
+
+def test_a_file_that_the_run_lacks_is_named(
+    lake: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = json.loads((lake / "manifest.json").read_text())["sha256"]
+    assert names.keys() >= {"curve.csv", "best_model.zip", "visits.npy", "policy.png", "episode.gif"}
+    for name in names:
+        shutil.copytree(lake, name)
+        Path(name, name).unlink()
+        told = rf"{name}: has no {name}$"
+        if not name.endswith((".png", ".gif", ".npy", "evaluations.npz")):
+            with pytest.raises(InputError, match=told):
+                export.main([name, "--to", "hub", "--out", "hub"])
+            continue
+        with pytest.raises(SystemExit) as ended:
+            export.main([name, "--to", "hub", "--out", "hub"])
+        assert ended.value.code == 1
+        assert re.fullmatch(f"warning: {told}", capsys.readouterr().err.strip())
 
 
 def test_the_hub_gets_the_tables_of_the_run_and_nothing_of_one_that_was_changed(

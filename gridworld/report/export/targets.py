@@ -18,11 +18,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import yaml
 
-from gridworld.base.atomic_write import replacing_folder, write_json, write_text
+from gridworld.base.atomic_write import remove_path, replacing_folder, write_bytes, write_json, write_text
 from gridworld.base.errors import InputError, install_command
 from gridworld.base.safe_read import read_object
 from gridworld.config.worlds import EnvConfig, MapConfig
@@ -44,9 +45,11 @@ _WANDB: dict[str, Any] = {
     "console": "off",
 }
 _MLFLOW_UI = "pip install mlflow && mlflow ui --backend-store-uri {place}"  # mlflow-skinny has no pages
+_SQLITE = "sqlite:///"
 _MLFLOWS_MOST = {"metrics": 1000, "params": 100}  # at a time
 _LONGEST_PARAM = 6000  # characters
 _RESULTS = "results.json"
+_WHOLE = "exported"  # a file that W&B's folder of a run has once all is in it
 _SHOWN = ("mean_reward", "success_rate", "mean_ep_length", "value", "regret")  # SB3's names before ours
 _WORLD = ("slip", "step_reward", "goal_reward", "trap_reward", "max_episode_steps")
 _CARD = """\
@@ -92,8 +95,10 @@ def to_wandb(run: ExportedRun, out: Path, project: str) -> str:
     """Write a run of W&B, offline unless WANDB_MODE says otherwise; returns its folder or address."""
     os.environ.setdefault("WANDB_MODE", "offline")
     os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
-    if there := next(out.glob(f"wandb/offline-run-*-{run.identity}"), None):
-        return str(there)
+    for there in sorted(out.glob(f"wandb/offline-run-*-{run.identity}")):
+        if (there / _WHOLE).exists():
+            return str(there)
+        remove_path(there)  # of an export that was killed
     import wandb
 
     def media(path: Path) -> Any:
@@ -113,8 +118,9 @@ def to_wandb(run: ExportedRun, out: Path, project: str) -> str:
             copy.write_bytes(path.read_bytes())
             artifact.add_file(str(copy), policy="immutable", skip_cache=True)
         written.log_artifact(artifact)
-        here = out / "wandb" / Path(written.dir).parent.name
-        return str(written.url if os.environ["WANDB_MODE"] == "online" else here)
+    here = out / "wandb" / Path(written.dir).parent.name
+    write_text(here / _WHOLE, "")
+    return str(written.url if os.environ["WANDB_MODE"] == "online" else here)
 
 
 def to_mlflow(run: ExportedRun, out: Path, project: str) -> str:
@@ -125,15 +131,22 @@ def to_mlflow(run: ExportedRun, out: Path, project: str) -> str:
 
     logging.getLogger("mlflow").setLevel(logging.WARNING)  # it tells how it makes its tables
     server = os.environ.get("MLFLOW_TRACKING_URI")
-    uri = server or f"sqlite:///{(out / 'mlflow.db').absolute().as_posix()}"
+    uri = server or f"{_SQLITE}{(out / 'mlflow.db').absolute().as_posix()}"
+    database = Path(uri.removeprefix(_SQLITE))
+    if uri.startswith(_SQLITE) and not database.exists():  # MLflow cannot use tables that are half made
+        with TemporaryDirectory(prefix="gridworld-") as elsewhere:
+            new = Path(elsewhere) / database.name
+            MlflowClient(tracking_uri=f"{_SQLITE}{new.as_posix()}").search_experiments()
+            write_bytes(database, new.read_bytes(), durable=True)
     client = MlflowClient(tracking_uri=uri)
     place = None if server else (out.absolute() / "artifacts").as_uri()
     found = client.get_experiment_by_name(project)
     experiment = found.experiment_id if found else client.create_experiment(project, artifact_location=place)
     tags = {"gridworld_run": run.identity, "group": run.group}
-    if client.search_runs([experiment], f"tags.gridworld_run = '{run.identity}' and status = 'FINISHED'"):
+    there = client.search_runs([experiment], f"tags.gridworld_run = '{run.identity}'")
+    if any(each.info.status == "FINISHED" for each in there):
         return uri
-    key = client.create_run(experiment, run_name=run.name, tags=tags).info.run_id
+    key = (there or [client.create_run(experiment, run_name=run.name, tags=tags)])[0].info.run_id
     curve = [*run.curve, (run.evidence.steps, {**run.curve[-1][1], **run.summary})]
     numbers = [Metric(name, float(each), 0, step) for step, row in curve for name, each in row.items()]
     settings = [Param(name, _text(value)) for name, value in run.settings.items()]
@@ -156,14 +169,12 @@ def _text(value: Any) -> str:
 
 def to_hub(run: ExportedRun, out: Path, project: str) -> str:
     """Write the folder of a run in `out`, named for it, and return it; nothing is uploaded."""
-    folder = out / run.name
-    with contextlib.suppress(InputError):  # it is something else
-        if read_object(folder / _RESULTS).get("run") == run.identity:
-            return str(folder)
-    if folder.exists():
-        folder = out / f"{run.name}-{run.identity}"
-        if folder.exists():
-            return str(folder)
+    places = (out / run.name, out / f"{run.name}-{run.identity}")
+    for folder in places:
+        with contextlib.suppress(InputError):  # it is something else
+            if read_object(folder / _RESULTS).get("run") == run.identity:
+                return str(folder)
+    folder = places[places[0].exists()]
     card = _card(run)
     with replacing_folder(folder) as new:
         shutil.copyfile(run.models[0], new / f"{run.group}.zip")
