@@ -285,7 +285,7 @@ def _game(options: argparse.Namespace) -> Game:
     given = {name: getattr(options, name) for name in _WORLD if getattr(options, name) is not None}
     if options.agent is not None and (fixed := [*options.words, *given.keys() & {"num_rows", "num_cols"}]):
         raise InputError(f"{fixed[0]}: with --agent, the world has the size it was trained on")
-    if runs := [word for word in options.words if os.sep in word and "=" not in word]:
+    if runs := [word for word in options.words if os.sep in word.partition("=")[0] or Path(word).is_dir()]:
         raise InputError(f"{runs[0]}: is not a setting such as env=cliff; a run is given by --agent")
     words = [*options.words, *(f"--config-dir={each}" for each in options.config_dir)]
     refuse_unclear(words)

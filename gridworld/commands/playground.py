@@ -57,9 +57,13 @@ def main(arguments: Sequence[str]) -> None:
 
 def _page(options: argparse.Namespace) -> str:
     words: list[str] = options.words
-    name = words[0] if len(words) == 1 and "=" not in words[0] else ""
+    alone = words[0] if len(words) == 1 else ""
+    is_path = Path(alone).exists() or os.sep in alone.partition("=")[0]  # a run of a sweep may be seed=0
+    name = alone if is_path or "=" not in alone else ""
     if name.endswith(os.sep) or (name and Path(name).is_dir()):
         return run_page(SavedRun(Path(name), options.trust, options.best))
+    if folders := [word for word in words if Path(word).is_dir()]:
+        raise InputError(f"{folders[0]}: is a folder; give it alone, since a run has its own settings")
     if os.sep in name and not Path(name).exists():
         raise InputError(f"{name}: no such run or map file")
     if options.best:

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from gridworld.base.console import printable, telling_if_slow
+from gridworld.base.console import printable, tell, telling_if_slow
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import check_no_link
 from gridworld.base.user_input import limited
@@ -46,9 +46,10 @@ def _record(options: argparse.Namespace) -> None:
     evaluator, mdp, visits = saved.evaluator(), saved.mdp, None
     try:
         visits = read_visits(saved.run, mdp.probability.shape[:2])
-    except InputError:  # the other pictures can be drawn without
+    except InputError as error:  # the other pictures can be drawn without
         if "visits" in formats:
             raise
+        tell(f"{error}; the pictures are drawn without")
     subject = Subject(saved.config, options.trust, evaluator, saved.snapshot(), saved.steps(), visits)
     drawn = {kind: drawer(MAPS[kind])(subject)(options.cell_size) for kind in formats if kind in MAPS}
     policy, limit = choose_policy(subject.snapshot, options.policy), evaluator.max_episode_steps

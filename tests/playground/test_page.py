@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shlex
+import shutil
 import subprocess
 import webbrowser
 from collections.abc import Callable
@@ -17,7 +18,8 @@ from selenium.webdriver.common.keys import Keys
 from gridworld.base.user_input import called_from
 from gridworld.commands import playground as command
 from gridworld.config.compose import named_world
-from gridworld.report.playground.page import link, world_page
+from gridworld.report.playground.page import link, run_page, world_page
+from gridworld.training.saved_run import SavedRun
 from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import load, parse
 
@@ -285,10 +287,48 @@ def test_a_phone_shows_it_whole(scheme: str, name: str, page: Page, browser: Any
         ("cliff --out ../page.html", "leads out of the current folder"),
         ("cliff --best", "--best: chooses between the models of a run"),
         ("env=deep_sea env.size=60", "is too large for the playground"),
+        ("runs/mine/seed=0", "runs/mine/seed=0: no such run or map file"),
     ],
 )
 def test_a_mistake_on_the_command_line(line: str, sentence: str, refusal: Callable[[str], str]) -> None:
     assert sentence in refusal(f"playground.py {line}")
+
+
+@pytest.fixture
+def run(pages: Path, tmp_path: Path) -> Path:
+    """Called as a run of a sweep may be, and as a setting is."""
+    return Path(shutil.copytree(pages / "map", tmp_path / "env=cliff"))
+
+
+def test_a_path_comes_before_a_setting(
+    run: Path,
+    refusal: Callable[[str], str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(run.parent)
+    for words in (["env=cliff"], ["env=cliff/"], [str(run)]):
+        command.main([*words, "--out", "page.html"])
+        assert '"title":"q_learning on aima_4x3, seed 0' in Path("page.html").read_text()
+    capsys.readouterr()
+    assert "env=cliff: is a folder; give it alone" in refusal("playground.py env=cliff env.slip=0.1")
+    assert "a run is given by --agent" in refusal("play.py env=cliff")
+    assert "a run is given by --agent" in refusal("play.py env=cliff env.slip=0.1")
+
+
+def test_what_is_damaged_is_named(run: Path, page: Page, capsys: pytest.CaptureFixture[str]) -> None:
+    [checkpoint] = run.glob("checkpoints/*")
+    content = checkpoint.read_bytes()
+    (run / "visits.npy").unlink()
+    checkpoint.write_bytes(content[: len(content) // 2])
+    content = run_page(SavedRun(run))
+    told = [f"{checkpoint}: not a state that can be read", f"{run}: has no visits.npy"]
+    for line, sentence in zip(capsys.readouterr().err.splitlines(), told, strict=True):
+        assert line.startswith(sentence)
+        assert line.endswith("; the page is without it")
+    (run / "page.html").write_text(content)
+    verdict = page(name=run / "page.html").find_element("id", "verdict").text
+    assert all(f"Missing: {sentence}" in verdict for sentence in told)
 
 
 def test_the_browser_opens_it(

@@ -24,9 +24,11 @@ from gridworld.base.errors import InputError
 from gridworld.base.safe_read import sealed
 from gridworld.base.serialization import decode, encode
 from gridworld.commands import jobs as jobs_command
+from gridworld.commands import record
 from gridworld.config.train import PICTURES
 from gridworld.report import tuning_study as tuning
 from gridworld.report.analysis import gather
+from gridworld.report.playground.page import run_page
 from gridworld.report.writer import charts, render
 from gridworld.run.reader import read_run
 from gridworld.sweeps.folder import SweepFolder
@@ -34,7 +36,7 @@ from gridworld.sweeps.tune.confirmation import certified_since
 from gridworld.sweeps.tune.study import is_claimed
 from gridworld.training.reproduce import check_whole
 from gridworld.training.resume import open_unfinished
-from gridworld.training.saved_run import SavedRun, read_visits
+from gridworld.training.saved_run import SavedRun
 
 Telling = Callable[[Path], str]  # all that a command makes of a folder; raises `InputError`
 
@@ -62,9 +64,12 @@ def evaluated(folder: Path) -> str:
 
 
 def recorded(folder: Path) -> str:
-    saved = SavedRun(folder / "run")
-    visits = read_visits(saved.run, saved.mdp.neighbour.shape)
-    return f"{saved.steps()} {visits}"
+    record.main([str(folder / "run"), "--format", "policy", "--cell-size", "20"])
+    return str((folder / "run" / "recording" / "policy.png").read_bytes())
+
+
+def shown(folder: Path) -> str:
+    return run_page(SavedRun(folder / "run"))
 
 
 def gone_on(folder: Path) -> str:
@@ -100,13 +105,14 @@ def claimed(folder: Path) -> str:
     return str(is_claimed(folder / "study", "mine"))
 
 
-OF_A_RUN = (reported, evaluated, recorded, gone_on, reproduced, confirmed)
+OF_A_RUN = (reported, evaluated, recorded, shown, gone_on, reproduced, confirmed)
 CASES: list[tuple[str, int, tuple[Telling, ...]]] = [
     ("run/manifest.json", 120, OF_A_RUN),
     ("run/curve.csv", 80, (reported, reproduced)),
     ("run/summary.json", 50, (reported, recorded, reproduced, confirmed)),
     ("run/model.zip", 30, (evaluated, reproduced)),
-    ("run/visits.npy", 20, (recorded, reproduced)),
+    ("run/visits.npy", 20, (recorded, shown, reproduced)),
+    ("run/checkpoints/000000002000.state", 20, (shown,)),
     *((f"run/{picture.file}", 5, (reported,)) for picture in PICTURES if picture.caption),
     ("sweep/sweep.json", 20, (listed,)),
     ("sweep/seed=0/manifest.json", 20, (listed,)),

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from gridworld.base.console import plain
+from gridworld.base.console import plain, tell
 from gridworld.base.errors import InputError
 from gridworld.base.serialization import StateError, fitting
 from gridworld.config.words import conf_folder
@@ -68,14 +68,18 @@ def run_page(saved: SavedRun) -> str:
     last, steps = saved.snapshot(), saved.steps()
     if not np.isfinite(last.values).all() or (last.q is not None and not np.isfinite(last.q).all()):
         raise InputError(f"{saved.run.folder}: the agent's values are not finite numbers")
-    moments = [moment for moment in _kept(saved) if moment.step < steps]
+    damage: list[str] = []
+    moments = [moment for moment in _kept(saved, damage) if moment.step < steps]
     greedy: list[IntArray] = [*(moment.greedy for moment in moments), last.greedy]
     values: list[NDArray[Any]] = [*(moment.values for moment in moments), last.values]
     regrets = [evaluator.score(one_hot_policy(each, mdp.num_actions)).regret for each in greedy]
     try:
         visits = read_visits(saved.run, mdp.next_state.shape[:2]).ravel().tolist()
-    except InputError:  # the rest can be shown without
+    except InputError as error:  # the rest can be shown without
         visits = None
+        damage.append(str(error))
+    for each in damage:
+        tell(f"{each}; the page is without it")
     data["run"] = {
         "title": f"{_name(config.agent.name)} on {_name(mdp.name)}, seed {config.seed}, {steps:,} steps",
         "agent": config.agent.name,
@@ -87,6 +91,7 @@ def run_page(saved: SavedRun) -> str:
         "values": [[float(f"{value:.{_DIGITS}g}") for value in each.tolist()] for each in values],
         "q": None if last.q is None else last.q.ravel().tolist(),
         "visits": visits,
+        "damage": list(map(plain, damage)),
     }
     return _page(data)
 
@@ -150,22 +155,29 @@ def shipped() -> dict[str, dict[str, Any]]:
     return found
 
 
-def _kept(saved: SavedRun) -> list[Moment]:
-    """The evaluations that a run's newest checkpoint has for the animation of learning; none without one."""
+def _kept(saved: SavedRun, damage: list[str]) -> list[Moment]:
+    """The evaluations that a run's newest checkpoint has for the animation of learning; none without one.
+
+    A sentence for each that is damaged is added to `damage`.
+    """
     size, actions = saved.mdp.next_state.shape[:2]
-    for _, state in Checkpoints(saved.run.folder).states():
+    if not saved.config.recording.learning:
+        return []
+    for path, state in Checkpoints(saved.run.folder).states():
         try:
+            if isinstance(state, StateError):
+                raise state
             with fitting():
                 history = PolicyHistory(size)
-                history.set_state(state["pictures"]["history"])  # type: ignore[index]
+                history.set_state(state["pictures"]["history"])
                 moments = history.moments()
                 for moment in moments:
                     is_whole = moment.values.shape == moment.greedy.shape == (size,) and moment.step >= 0
                     if not (is_whole and np.isfinite(moment.values).all() and moment.greedy.max() < actions):
                         raise StateError("is not a history of this world")
             return moments
-        except StateError:
-            continue
+        except StateError as error:
+            damage.append(f"{path}: {error}")
     return []
 
 

@@ -190,7 +190,7 @@ function showScore(all) {
   if (!all) return;
   const limit = Math.min(world.limit, 10000), { goal, trap, length } = outcome(world, policy, limit);
   const count = number => number.toLocaleString("en"), sentences = [];
-  if (mode === "run") sentences.push(`After ${count(run.steps[app.moment])} steps.`);
+  if (mode === "run") sentences.push(`After ${count(run.steps[app.moment])} steps.`, ...run.damage.map(each => `Missing: ${each}.`));
   if (process instanceof Learner) sentences.push(`${count(process.steps)} steps, ${count(process.episodes)} episodes.`);
   else if (mode === "value_iteration" && process.steps)
     sentences.push(`Sweep ${process.steps}: largest change ${short(process.change)}.`);
