@@ -24,7 +24,7 @@ from gridworld.api.settings import Override, words
 from gridworld.base.console import tell
 from gridworld.base.errors import InputError, failure
 from gridworld.base.signals import Interrupted
-from gridworld.base.user_input import limited
+from gridworld.base.user_input import as_path, limited
 from gridworld.config.compose import compose as compose_words
 from gridworld.config.train import TrainConfig
 from gridworld.diagnosis import verdict
@@ -215,7 +215,7 @@ def open_run(folder: str | PathLike[str], trust: bool = False) -> RunResult:
         >>> open_run("runs/mine").policy.greedy.shape
         (30,)
     """
-    path = Path(folder).expanduser()
+    path = as_path("open_run: folder", folder)
     with limited():
         saved = SavedRun(path, trust)
         return RunResult(saved, path, saved.agent)
@@ -255,7 +255,7 @@ def diagnose(
                 run.config, words, run.curve, run.visits, run.evaluator, run.agent, run.policy
             )
         else:
-            folder = Path(run).expanduser()
+            folder = as_path("diagnose: run", run)
             saved = SavedRun(folder, trust)
             evidence = Evidence.of(saved)
         found = verdict.diagnose(evidence)

@@ -25,7 +25,7 @@ from gridworld.api.runs import RunResult, open_run
 from gridworld.api.settings import Override, command_words
 from gridworld.base.console import ProgressLine, printable
 from gridworld.base.errors import InputError
-from gridworld.base.user_input import limited
+from gridworld.base.user_input import as_path, limited
 from gridworld.config.recipe_file import literal
 from gridworld.report.tuning_study import TuningStudy, find_tunings
 from gridworld.report.writer import PAGE
@@ -49,8 +49,8 @@ class SweepResult:
     """A sweep, by its `folder`: what `sweep` and `open_sweep` return. A notebook shows its results."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._sweep = sweep_folder.open_sweep(folder)
+        self.folder = as_path("SweepResult: folder", folder)
+        self._sweep = sweep_folder.open_sweep(self.folder)
 
     @property
     def rows(self) -> list[dict[str, Any]]:
@@ -134,7 +134,7 @@ def open_sweep(folder: str | PathLike[str]) -> SweepResult:
     Raises:
         InputError: the folder holds no sweep, or its list of jobs was changed.
     """
-    return SweepResult(Path(folder).expanduser())
+    return SweepResult(as_path("open_sweep: folder", folder))
 
 
 def tune(
@@ -174,7 +174,7 @@ def record(
     Raises:
         InputError: a mistake in the arguments, or no finished run.
     """
-    folder = run.folder if isinstance(run, RunResult) else Path(run).expanduser()
+    folder = run.folder if isinstance(run, RunResult) else as_path("record: run", run)
     if folder is None:
         raise InputError("run: has no folder, so that its files are gone; train it with folder=...")
     place = Path(out or folder / "recording").expanduser()

@@ -10,6 +10,7 @@ from typing import Any
 
 from gridworld.base.errors import InputError
 
+MOST_ENVS = 2**17  # eight times the largest batch that any measurement here is faster with
 STEP_LIMIT = 100  # steps of an episode, where neither the world nor a setting says another
 MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them
 LARGEST_INTEGER = 2**63  # beyond, neither arrays nor the files of a run have them

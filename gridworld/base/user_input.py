@@ -87,6 +87,13 @@ def _shown(size: float) -> str:
     return f"{size / factor:,.3g} {unit}" if size < 1e15 else "more than a million GB"
 
 
+def as_path(name: str, value: Any) -> Path:
+    """An argument that is a path, as one; refuses anything else."""
+    if not isinstance(value, str | PathLike) or not isinstance(os.fspath(value), str):
+        raise InputError(f"{name}={str(value)[:50]}: must be a path, a str or a Path")
+    return Path(value).expanduser()
+
+
 @contextmanager
 def called_from(folder: Path) -> Iterator[None]:
     """In this block the command counts as called from `folder`, whatever the current folder is."""

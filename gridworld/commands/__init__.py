@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import math
+import re
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -102,6 +103,9 @@ def whole(low: float = -math.inf, high: float = math.inf) -> Callable[[str], int
     return number
 
 
+_OUT_OF_MEMORY = re.compile("failed to map|cannot allocate memory", re.IGNORECASE)  # of a library, at import
+
+
 def call(command: str) -> None:
     """Run a command with the words in `sys.argv`."""
     run(import_module(f"gridworld.commands.{command}").main)
@@ -118,6 +122,13 @@ def run(main: Callable[[Sequence[str]], None]) -> None:
             main(sys.argv[1:])
     except (InputError, OSError) as error:
         tell_error(str(error) if isinstance(error, InputError) else failure(error))
+        sys.exit(EXIT_CODE)
+    except (MemoryError, ImportError) as error:
+        if not isinstance(error, MemoryError) and not _OUT_OF_MEMORY.search(str(error)):
+            raise
+        tell_error(
+            f"there is not enough memory ({str(error)[:80] or 'MemoryError'}); free some, or raise ulimit -v"
+        )
         sys.exit(EXIT_CODE)
     except Interrupted as interruption:
         print(str(interruption), file=sys.stderr)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gridworld.base.bounds import LARGEST_INTEGER, discount
+from gridworld.base.bounds import LARGEST_INTEGER, MOST_ENVS, discount
 from gridworld.base.errors import InputError
 from gridworld.config.fields import (
     BOUNDS,
@@ -36,7 +36,6 @@ from gridworld.config.fields import (
 )
 from gridworld.config.worlds import SOURCES, EnvConfig, MapConfig
 
-MOST_ENVS = 2**17  # eight times the largest batch that any measurement here is faster with
 MOST_BONUS = 10**6  # of exploration; any reward beside it would be lost in the numbers of a network
 MOST_THREADS = 1024
 AUTO = "auto"  # checkpoints as often as they cost next to nothing

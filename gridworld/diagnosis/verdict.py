@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gridworld.base.atomic_write import tidy
 from gridworld.base.console import command
 from gridworld.base.errors import InputError
 from gridworld.config.fields import Use
@@ -152,6 +153,8 @@ def try_offers(saved: SavedRun, found: Diagnosis, folder: Path, trust: bool = Fa
     from gridworld.run.folder import claimed
     from gridworld.training.train import train
 
+    for each in folder.glob("*"):  # what a killed one left half written
+        tidy(each)
     for words, line in zip(found.offers, found.commands, strict=True):
         place = next(each for n in range(1, 10**6) if not (each := folder / str(n)).exists()).absolute()
         config = dataclasses.replace(compose(words), env=saved.config.env)

@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from gridworld.base.bounds import STEP_LIMIT, positive_int
+from gridworld.base.bounds import MOST_ENVS, STEP_LIMIT, Bounds, positive_int
 from gridworld.base.errors import InputError
 from gridworld.base.serialization import State, StateError, fill, generator_state, set_generator_state
 from gridworld.envs import rendering as drawing
@@ -101,6 +101,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         if not isinstance(stratified, bool):
             raise InputError(f"stratified={stratified!r}: must be True or False")
         self.num_envs = positive_int("num_envs", num_envs)
+        Bounds(1, MOST_ENVS).check("num_envs", self.num_envs)
         self.max_episode_steps = (
             None if max_episode_steps is None else positive_int("max_episode_steps", max_episode_steps)
         )

@@ -148,6 +148,8 @@ def claimed(folder: Path, begun: str = MANIFEST, alone: bool = True) -> Iterator
     Where others may work in it too, it is not `alone`. An `OSError` of the block names the folder, if it
     names nothing.
     """
+    if folder.resolve() == folder.resolve().parent:
+        raise InputError(f"{folder}: is the root of the file system; name a folder in it, e.g. /home/me/run")
     is_first = not folder.parent.exists()
     make_folder(folder.parent)
     folder.mkdir(exist_ok=True)

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gridworld.base.bounds import positive_int
 from gridworld.base.console import telling_if_slow
+from gridworld.base.errors import InputError
 from gridworld.world.chain import Chain, Outcome, one_hot_policy
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 from gridworld.world.solver import Solution, solved
@@ -77,8 +79,10 @@ class Evaluator:
     """
 
     def __init__(self, mdp: Mdp, gamma: float, max_episode_steps: int) -> None:
+        if not isinstance(mdp, Mdp):
+            raise InputError(f"mdp={str(mdp)[:50]}: must be a compiled world, as from compile_env")
         self.mdp = mdp
-        self.max_episode_steps = max_episode_steps
+        self.max_episode_steps = positive_int("max_episode_steps", max_episode_steps)
         with telling_if_slow(f"solving the world, {mdp.num_states:,} states"):
             self.solution: Solution = solved(mdp, gamma)
         self.optimal_value = self._at_start(self.solution.v)

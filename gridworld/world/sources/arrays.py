@@ -25,19 +25,28 @@ A run's world holds the fields of an `Mdp` as they are.
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
+import zipfile
 from collections.abc import Callable, Mapping
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError, in_short
-from gridworld.base.user_input import check_memory, imported, npz_arrays, npz_bytes, open_users_file
+from gridworld.base.user_input import DAMAGED, check_memory, imported, npz_arrays, npz_bytes, open_users_file
 from gridworld.world.mdp import Mdp, frozen
-from gridworld.world.outcomes import Outcomes, checked_text, mdp_from_outcomes, verified
+from gridworld.world.outcomes import (
+    MOST_STATES,
+    Outcomes,
+    check_size,
+    checked_text,
+    mdp_from_outcomes,
+    verified,
+)
 
 _TABLES = ("next_state", "probability", "reward", "terminated", "success")
 _NEEDED = ("next_state", "reward", "terminated", "start")
@@ -179,6 +188,8 @@ def _read(path: str | PathLike[str]) -> bytes:
                     f"env.path={given}: is larger than {_MOST_BYTES / 2**30:.0f} GiB; give a smaller world"
                 )
             check_memory(given, 2 * size)
+            _check_shapes(f"env.path={given}", file)
+            file.seek(0)
             return file.read(_MOST_BYTES)
     except InputError:
         raise
@@ -187,6 +198,27 @@ def _read(path: str | PathLike[str]) -> bytes:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", error)
         raise InputError(f"env.path={given}: cannot be read ({reason}); give an .npz file") from None
+
+
+def _check_shapes(where: str, file: BinaryIO) -> None:
+    """Refuse arrays that no world has by what their headers say, before they are read."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            for info in archive.infolist():
+                with archive.open(info) as member:
+                    is_first = np.lib.format.read_magic(member) == (1, 0)
+                    form = np.lib.format
+                    read = form.read_array_header_1_0 if is_first else form.read_array_header_2_0
+                    shape, _, _ = read(member)
+                    name = info.filename.removesuffix(".npy")
+                    if name in _TABLES and len(shape) > 1:
+                        check_size(where, shape[0], shape[1], math.prod(shape[2:]))
+                    elif math.prod(shape[:1]) > MOST_STATES:
+                        raise InputError(f"{where}: {name} has {shape[0]:,} entries, too many for a world")
+    except InputError:
+        raise
+    except DAMAGED:  # which reading it says in its own words
+        return
 
 
 def world_bytes(mdp: Mdp) -> bytes:
