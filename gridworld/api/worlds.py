@@ -36,13 +36,14 @@ def evaluate(
             or its policy, which acts as its `predict` does, with the environment's `action_masks()` if it
             takes them; a finished run, or its `policy`; or a table: actions (S,), whole numbers from 0, or
             their probabilities (S, A); by observations where the environment shows whole numbers.
-        env: an environment or a batch of Gymnasium or SB3: a GridWorld, or one with a transition table; a
-            compiled world (`compile_mdp`, `compile_env`); a finished run; what `env=NAME` means on a command
-            line, or an id of Gymnasium; or a map, its file or a `Layout`. The task is that of the
-            environment with its wrappers, which must be neutral or functions; see
-            `gridworld.world.wrappers`. A model sees states as this environment shows them; where that
-            is the world's own observation of another kind, by the kind that has the model's observation
-            space. None: the environment that the model or run was trained on.
+        env: an environment of Gymnasium with all its wrappers, a class or a function that makes one, or a
+        batch
+            of Gymnasium or SB3; a compiled world (`compile_mdp`, `compile_env`); a finished run; what
+            `env=NAME` means on a command line, or an id of Gymnasium; or a map, its file or a `Layout`.
+            What all layers of an environment hold is its state, see `gridworld.world.door`; it is left as
+            it was. A model sees states as this environment shows them; where that is the world's own
+            observation of another kind, by the kind that has the model's observation space. None: the
+            environment that the model or run was trained on.
         gamma: discount of value and regret; None: 0.99, or a run's own `evaluation.gamma`.
         q: in place of `model_or_table`: Q values (S, A), of which the first of the best actions is taken.
         deterministic: whether to score a model's best action in every state, or the distribution that it
@@ -54,7 +55,7 @@ def evaluate(
         probabilities of `goal`, `trap` and `timeout`, `expected_return` and `expected_length`.
 
     Raises:
-        InputError: no world that is known exactly; a wrapper that may change it in an unknown way; a table
+        InputError: no world that is known exactly; a table
             that does not fit it; a model that keeps a memory, or sees or does something else.
 
     Example:
@@ -135,17 +136,19 @@ def compile_env(env: Any) -> Mdp:
     """Compile an environment into the tables of its world. The environment is left as it is.
 
     Args:
-        env: an environment of Gymnasium with a transition table (`P` and `initial_state_distrib`: FrozenLake,
-            CliffWalking, Taxi and their like), a GridWorld, or a batch of them, of Gymnasium or SB3. Wrappers
-            that transform rewards or actions by a function are compiled into the tables. Or a name: what
-            `env=NAME` means on a command line, or an id of Gymnasium.
+        env: an environment of Gymnasium with all its wrappers, a class or a function that makes one, or a
+        batch
+            of Gymnasium or SB3. A GridWorld, and one with a transition table that its steps follow
+            (`P` and `initial_state_distrib`: FrozenLake, CliffWalking, Taxi), is known; of any other, every
+            action is tried in a copy of every state. Or a name: what `env=NAME` means on a command line, or
+            an id of Gymnasium.
 
     Returns:
         The world, with the environment's step limit as `max_episode_steps`; a GridWorld's own world.
 
     Raises:
-        InputError: no table; an environment whose steps are not those of its table; or a wrapper that may
-            change the task in an unknown way.
+        InputError: its states are too many or continuous, it does not follow its own table, or it depends on
+            more than its attributes and `np_random`.
 
     Example:
         >>> import gymnasium

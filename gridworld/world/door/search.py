@@ -13,16 +13,14 @@ import itertools
 import math
 import pickle
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from enum import EnumType
 from fractions import Fraction
 from typing import Any, NoReturn
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from gridworld.base.console import telling_if_slow
 from gridworld.base.errors import InputError, in_short, on_a_line
@@ -30,7 +28,9 @@ from gridworld.base.user_input import check_memory
 from gridworld.world.door import known
 from gridworld.world.door.beliefs import Step, lumped
 from gridworld.world.door.layers import Changed, Env, Layers, Limited, Timed
+from gridworld.world.door.observations import leaves
 from gridworld.world.door.rejection import Rejecting
+from gridworld.world.door.word import check_by_word
 from gridworld.world.outcomes import MOST_ACTIONS
 
 OVER = -1  # in place of the state in which an episode ends
@@ -41,8 +41,6 @@ _MOST_BYTES = 2**31  # of all copies and observations together
 _SAMPLED = 16  # of so many states the copy of one is kept, to name what keeps changing
 _WALKS, _WALK = 20, 10  # walks that show which large attributes change, and their steps
 _FACING = ("right", "down", "left", "up")  # minigrid's directions
-_STEPS_OF_WORD, _EPISODES_OF_WORD = 3_000, 8  # of episodes in which what is left out must not matter
-_LONGEST, _LONG = 10_000, 300  # steps of the first of them, and of others before any action is taken
 _MOST_RESETS = 1_000  # that lead to other states than usual; more will not turn out to be alike
 _LONGEST_NAME = 60  # of a state that is called by its observation
 _OLD_API = (
@@ -57,7 +55,6 @@ _INTS = (
     "it answers an action that is an int in another way than np.int64, which learners send; take both alike, "
     "e.g. by int(action)"
 )
-_NO_LIMIT = "it truncates some episodes earlier than others, so it has no single step limit"
 Named = tuple[str, tuple[str, int, int] | None]  # what a reader calls a state, and its place
 Start = tuple[Fraction, int, bytes]  # a probability, the number of a state, a digest of the observation
 Result = tuple[int, bytes, float, bool, bool]
@@ -140,9 +137,9 @@ class Search:
                 self._explored(counts_time=True)
 
     def _explored(self, counts_time: bool) -> None:
-        runs = (Search._reset.__code__, Search._stepped.__code__)
-        self._branching = Rejecting(self.where, lambda *held: self.layers.everything(*held), runs)
-        self.layers = layers = Layers(self.where, self.env, self._branching, counts_time)
+        runs = (Search.reset_from.__code__, Search.stepped_from.__code__)
+        self.branching = Rejecting(self.where, lambda *held: self.layers.everything(*held), runs)
+        self.layers = layers = Layers(self.where, self.env, self.branching, counts_time)
         self._is_complete = counts_time  # nothing that an environment may read is left out
         with layers.restored():
             begin, before = layers.take(), layers.values()
@@ -161,7 +158,7 @@ class Search:
                     self._explore(layers.limit)
                     layers.check_left()
                     if self.ignore or self._read is not None:
-                        self._check_word()
+                        self.limit_met = check_by_word(self)
                     layers.check_generators()
                     return
                 except Changed as error:
@@ -177,7 +174,7 @@ class Search:
     def walk(self, kind: type) -> list[Any]:
         """What some walks with numpy's own generator and actions of a type show."""
         numbers, shown = np.random.default_rng(0), list[Any]()
-        self._branching.sampling = np.random.default_rng(1)
+        self.branching.sampling = np.random.default_rng(1)
         try:
             for _ in range(_WALKS):
                 shown.append(self._see(self.layers.env.reset()[0]))
@@ -192,7 +189,7 @@ class Search:
         except Exception as error:  # which the search meets too, and refuses
             shown.append(str(error))
         finally:
-            self._branching.sampling = None
+            self.branching.sampling = None
         return shown
 
     def _explore(self, limit: int | None) -> None:
@@ -207,15 +204,15 @@ class Search:
         most_states = self._most_states
         first = self.layers.take()
         if unknown := [each for each in self.ignore if each not in self.layers.names()]:
-            self._merged(functools.partial(self._reset, first))  # which may make it
+            self._merged(functools.partial(self.reset_from, first))  # which may make it
             if each := next((each for each in unknown if each not in self.layers.names()), None):
                 raise InputError(
                     f"env.ignore={list(self.ignore)}: {self._name} has no attribute {each}; it has "
                     f"{', '.join(dict.fromkeys(self.layers.names()))}"
                 )
-        self._first = first
-        self.starts = self._merged(functools.partial(self._reset, first))
-        self._first_start = self._branching.first(functools.partial(self._reset, first))[:2]
+        self.first = first
+        self.starts = self._merged(functools.partial(self.reset_from, first))
+        self._first_start = self.branching.first(functools.partial(self.reset_from, first))[:2]
         self._waiting: list[State] = []
         self._open(each.following for each in self.starts)
         waiting = self._waiting
@@ -254,7 +251,7 @@ class Search:
 
     # ---- runs ----
 
-    def _reset(self, copy: bytes) -> Result:
+    def reset_from(self, copy: bytes) -> Result:
         self.layers.put(copy)
         try:
             returned = self.layers.env.reset()
@@ -262,9 +259,9 @@ class Search:
             raise self._failed("a reset", error) from error
         if not (isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[1], dict)):
             raise self.refusal(f"reset() returns {on_a_line(returned)}, {_OLD_API}")
-        return *self._state_after(returned[0], 0), 0.0, False, False
+        return *self.state_after(returned[0], 0), 0.0, False, False
 
-    def _stepped(self, copy: bytes, depth: int, action: Any) -> Result:
+    def stepped_from(self, copy: bytes, depth: int, action: Any) -> Result:
         self.layers.put(copy)
         limited = self.layers.limited
         if limited is not None:
@@ -291,7 +288,7 @@ class Search:
                 f"a step with action {action} pays {on_a_line(reward)}; must be a finite number"
             )
         is_over = bool(terminated)
-        return *self._state_after(observation, depth + 1, is_over), paid, is_over, bool(truncated)
+        return *self.state_after(observation, depth + 1, is_over), paid, is_over, bool(truncated)
 
     def _failed(self, what: str, error: Exception) -> Exception:
         if isinstance(error, InputError):
@@ -309,7 +306,7 @@ class Search:
                 f"its {self._what_changes()}"
             )
         steps = [
-            self._merged(functools.partial(self._stepped, state.copy, state.depth, np.int64(action)))
+            self._merged(functools.partial(self.stepped_from, state.copy, state.depth, np.int64(action)))
             for action in range(self.num_actions)
         ]
         if self.layers.limited is not None and self.layers.may_see_cuts:
@@ -331,7 +328,7 @@ class Search:
         return steps
 
     def _merged(self, run: Callable[[], Result]) -> list[Step]:
-        found = self._branching.outcomes(run)
+        found = self.branching.outcomes(run)
         return [Step(probability, *result) for result, probability in found.items()]
 
     def _check_cut(self, state: State, steps: list[list[Step]], limited: Limited) -> None:
@@ -339,9 +336,9 @@ class Search:
         limited.cuts = True
         try:
             for action, usual in enumerate(steps):
-                run = functools.partial(self._stepped, state.copy, state.depth, np.int64(action))
+                run = functools.partial(self.stepped_from, state.copy, state.depth, np.int64(action))
                 cut: dict[Any, Fraction] = {}
-                for (_, *shown), probability in self._branching.outcomes(run).items():
+                for (_, *shown), probability in self.branching.outcomes(run).items():
                     key = (*shown[:3], shown[2] or shown[3])
                     cut[key] = cut.get(key, Fraction(0)) + probability
                 whole: dict[Any, Fraction] = {}
@@ -353,63 +350,15 @@ class Search:
         finally:
             limited.cuts = False
 
-    def _check_word(self) -> None:
-        """Episodes with numpy's own generator, whose steps must be those found without what is left out."""
-        numbers, steps, episode = np.random.default_rng(0), 0, 0
-        self._branching.sampling = np.random.default_rng(1)
-        try:
-            while steps < _STEPS_OF_WORD or episode < _EPISODES_OF_WORD:
-                steps += self._episode(numbers, _LONGEST if episode == 0 else int(numbers.integers(1, _LONG)))
-                episode += 1
-        finally:
-            self._branching.sampling = None
-
-    def _episode(self, numbers: np.random.Generator, lives: int) -> int:
-        """Steps that do not end it for so long, if there are such, then any; returns how many there were."""
-        size, took = len(self.states), 0
-        number = self._reset(self._first)[0]
-        while True:
-            rows = self.states[number].steps if number < size else ()
-            living = [a for a, row in enumerate(rows) if not any(step.terminated for step in row)]
-            choice = living if took < lives and living else range(self.num_actions)
-            action = int(choice[int(numbers.integers(len(choice)))])
-            if not rows or took >= 2 * lives + _LONG or took >= _LONGEST:
-                return took
-            observation, reward, terminated, truncated, _ = self.layers.env.step(np.int64(action))
-            took += 1
-            number, seen = self._state_after(observation, took, bool(terminated))
-            found = number, seen, float(reward), bool(terminated)
-            if found not in [tuple(step[1:5]) for step in rows[action]]:
-                self._refuse_word(took, found, rows[action])
-            if truncated and not terminated:
-                if self.limit_met not in (None, took):
-                    raise self.refusal(_NO_LIMIT)
-                self.limit_met = took
-            if terminated or truncated:
-                return took
-            if self.limit_met is not None and took > self.limit_met:
-                raise self.refusal(_NO_LIMIT)
-
-    def _refuse_word(self, took: int, found: Any, row: Sequence[Step]) -> NoReturn:
-        what, shown = "state", ""
-        if row and found[2] not in [step.reward for step in row]:
-            what, shown = "reward", f" ({found[2]}, enumerated as {row[0].reward})"
-        ignored = ", ".join(self.ignore)
-        word = f"{ignored}, which env.ignore leaves out" if ignored else "more than state= says"
-        raise self.refusal(
-            f"after {took} steps of an episode its {what} is not the enumerated one{shown}, so it depends on "
-            f"{word}"
-        )
-
     # ---- resets ----
 
     def _check_first_reset(self, copy: bytes) -> None:
-        number, seen = self._branching.first(functools.partial(self._reset, copy))[:2]
+        number, seen = self.branching.first(functools.partial(self.reset_from, copy))[:2]
         self._compare_resets([(Fraction(1), *self._first_start)], [(Fraction(1), number, seen)], copy)
 
     def _check_resets(self, copy: bytes) -> None:
         """A reset must lead to the same, whatever it draws."""
-        found = self._merged(functools.partial(self._reset, copy))
+        found = self._merged(functools.partial(self.reset_from, copy))
         self._compare_resets([each[:3] for each in self.starts], [each[:3] for each in found], copy)
 
     def _compare_resets(self, usual: list[Start], found: list[Start], copy: bytes) -> None:
@@ -432,7 +381,7 @@ class Search:
                 self._refuse_reset(copy)
 
     def _refuse_reset(self, copy: bytes) -> NoReturn:
-        usual, found = self._values_after_resets(self._first), self._values_after_resets(copy)
+        usual, found = self._values_after_resets(self.first), self._values_after_resets(copy)
         changed = _listed(name for name in usual | found if usual.get(name) != found.get(name))
         raise self.refusal(
             f"a reset does not always lead to the same state (in {changed}), so its states cannot be "
@@ -444,17 +393,17 @@ class Search:
         values: dict[str, set[bytes]] = {}
 
         def reset() -> Result:
-            result = self._reset(copy)
+            result = self.reset_from(copy)
             for (_, name), value in self.layers.values(self.ignore).items():
                 values.setdefault(name, set()).add(value)
             return result
 
-        self._branching.outcomes(reset)
+        self.branching.outcomes(reset)
         return values
 
     # ---- states ----
 
-    def _state_after(self, observation: Any, depth: int, is_over: bool = False) -> tuple[int, bytes]:
+    def state_after(self, observation: Any, depth: int, is_over: bool = False) -> tuple[int, bytes]:
         """The number of the state that the environment is in, and a digest of the observation."""
         seen = self._see(observation)
         if is_over and seen not in self.ends:
@@ -467,7 +416,7 @@ class Search:
             key = self._copied(self.ignore)
         short = hashlib.blake2b(key, digest_size=16).digest()
         if is_over:
-            if short not in self._ended and short not in self._by_copy and self._branching.sampling is None:
+            if short not in self._ended and short not in self._by_copy and self.branching.sampling is None:
                 self._ended.add(short)
                 self._waiting_ends.append(self._copied())
             return OVER, seen
@@ -524,20 +473,15 @@ class Search:
 
     def _see(self, observation: Any) -> bytes:
         """A digest of an observation as a learner gets it, in the types of its space."""
-        leaves = list(_leaves(observation, self.env.observation_space, self._misfit))  # whose sizes are known
-        whole = b"".join(each.tobytes() if isinstance(each, np.ndarray) else each for each in leaves)
+        parts = list(leaves(observation, self.env.observation_space, self.refusal))  # whose sizes are known
+        whole = b"".join(each.tobytes() if isinstance(each, np.ndarray) else each for each in parts)
         seen = whole if len(whole) <= 16 else hashlib.blake2b(whole, digest_size=17).digest()
         if seen not in self.observations:
-            self.observations[seen] = leaves
+            self.observations[seen] = parts
             shown = " ".join(str(observation).split())
             self.shown[seen] = f"observation {shown}" if len(shown) <= _LONGEST_NAME else ""
-            self._num_bytes += sum(each.nbytes for each in leaves if isinstance(each, np.ndarray))
+            self._num_bytes += sum(each.nbytes for each in parts if isinstance(each, np.ndarray))
         return seen
-
-    def _misfit(self, observation: Any, space: gym.Space[Any]) -> InputError:
-        return self.refusal(
-            f"an observation is {on_a_line(observation)}, which is not in its space {on_a_line(space)}"
-        )
 
     # ---- what is said of it ----
 
@@ -555,74 +499,18 @@ class Search:
             f"ignore irrelevant attributes, e.g. env.ignore=[{names.split(',')[0]}]"
         )
 
-    def own_limit(self) -> int | None:
-        """The time at which the environment itself truncates all episodes, if any."""
-        steps = ((each.depth + 1, step) for each in self.states for row in each.steps for step in row)
-        truncated: dict[bool, set[int]] = {True: set(), False: set()}  # times of steps that are no end
-        for when, step in steps:
-            if not step.terminated:
-                truncated[step.truncated].add(when)
-        if not truncated[True]:
-            return self.limit_met
-        limit = min(truncated[True])
-        if max(truncated[False], default=0) >= limit:
-            raise self.refusal(_NO_LIMIT)
-        return limit
-
-    def action_names(self) -> list[str] | None:
-        """The names in an enumeration `actions`, if the environment has one that fits."""
-        actions = getattr(self.env.unwrapped, "actions", None)
-        if not isinstance(actions, EnumType):
-            return None
-        names = {member.value: member.name for member in actions}  # type: ignore[var-annotated]
-        numbers = range(self.num_actions)
-        return [names[number] for number in numbers] if names.keys() >= set(numbers) else None
-
 
 def traits(env: Env) -> Any:
     """What two environments that are one task have in common: a walk, and what never changes."""
     search = Search("env", env)
     branching = Rejecting("env", bytes, ())
-    search.layers, search._branching = Layers("env", env, branching), branching
+    search.layers, search.branching = Layers("env", env, branching), branching
     with search.layers.restored():
         before = search.layers.values()
         shown = search.walk(np.int64)
         after = search.layers.values()
     constant = {key: value for key, value in before.items() if after.get(key) == value}
     return [type(each) for each in search.layers.layers], search.layers.limit, constant, shown
-
-
-def _leaves(
-    observation: Any, space: gym.Space[Any], misfit: Callable[[Any, gym.Space[Any]], InputError]
-) -> Iterator[Any]:
-    """The arrays in an observation, each of the type of its space; bytes of what is none."""
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        inner = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
-        for key, each in inner:
-            try:
-                part = observation[key]
-            except (TypeError, KeyError, IndexError):
-                raise misfit(observation, space) from None
-            yield from _leaves(part, each, misfit)
-    elif isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
-        try:
-            given = np.asarray(observation)
-            array: NDArray[Any] = given.astype(space.dtype, order="C")
-            fits = given.shape == space.shape and given.dtype.kind in "biuf"
-            if fits and given.dtype != array.dtype and not (array == given).all():
-                fits = np.allclose(array.astype(np.float64), given.astype(np.float64), 1e-3, 1e-6, True)
-            if isinstance(space, spaces.Discrete):
-                fits = fits and bool(space.start <= array < space.start + space.n)
-        except (TypeError, ValueError, OverflowError):
-            fits = False
-        if not fits:
-            raise misfit(observation, space)
-        yield array
-    else:
-        try:
-            yield pickle.dumps(observation)
-        except Exception:
-            raise misfit(observation, space) from None
 
 
 def _is_continuous(space: gym.Space[Any]) -> bool:

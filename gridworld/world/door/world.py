@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from enum import EnumType
 from typing import Any
 
 import gymnasium as gym
@@ -24,7 +25,9 @@ from numpy.typing import NDArray
 from gridworld.base.user_input import check_memory
 from gridworld.world.door.beliefs import Beliefs, Node
 from gridworld.world.door.layers import Env
+from gridworld.world.door.observations import own_array, stacked, taken
 from gridworld.world.door.search import MOST_SECONDS, MOST_STATES, Named, Search, State
+from gridworld.world.door.word import NO_LIMIT
 from gridworld.world.mdp import ENUMERATED, Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 
@@ -110,20 +113,20 @@ class _World:
         if len(found) == len(named):
             places = np.array([(panels.index(facing), row, column) for facing, row, column in found])
             places[:, 1:] -= places[:, 1:].min(axis=0)  # without the walls around the room
-        limits = [each for each in (search.own_limit(), search.layers.limit) if each is not None]
-        rows = _stacked(space, iter(zip(*leaves, strict=True)))
+        limits = [each for each in (_own_limit(search), search.layers.limit) if each is not None]
+        rows = stacked(space, iter(zip(*leaves, strict=True)))
         mdp = mdp_from_outcomes(
             name,
             _renumbered(beliefs.outcomes(name, search.num_actions), numbers, size),
-            action_names=search.action_names(),
+            action_names=_action_names(search),
             places=places,
             panel_names=panels,
             max_episode_steps=min(limits, default=None),
-            own_observation=_own(space, rows),
+            own_observation=own_array(space, rows),
         )
         names = tuple(each for each, _ in named)
         mdp = replace(mdp, state_names=names if all(names) else (), truth=self._truth())
-        shown = _taken(rows, mdp.number)
+        shown = taken(rows, mdp.number)
         self.found = Found(mdp, space, shown, masks[mdp.number] if search.has_masks else None)
 
     def _numbers(self) -> tuple[NDArray[Any], int]:
@@ -195,29 +198,26 @@ def _renumbered(outcomes: Outcomes, numbers: NDArray[Any], size: int) -> Outcome
     return Outcomes(**tables, start=start, success=success)
 
 
-def _stacked(space: gym.Space[Any], leaves: Any) -> Any:
-    """Observations as arrays of all states, from an iterator over the leaves of a space."""
-    if isinstance(space, spaces.Dict):
-        return {key: _stacked(each, leaves) for key, each in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        return tuple(_stacked(each, leaves) for each in space.spaces)
-    found = next(leaves)
-    return None if isinstance(found[0], bytes) else np.stack(found)
+def _own_limit(search: Search) -> int | None:
+    """The time at which the environment itself truncates all episodes, if any."""
+    steps = ((each.depth + 1, step) for each in search.states for row in each.steps for step in row)
+    truncated: dict[bool, set[int]] = {True: set(), False: set()}  # times of steps that are no end
+    for when, step in steps:
+        if not step.terminated:
+            truncated[step.truncated].add(when)
+    if not truncated[True]:
+        return search.limit_met
+    limit = min(truncated[True])
+    if max(truncated[False], default=0) >= limit:
+        raise search.refusal(NO_LIMIT)
+    return limit
 
 
-def _taken(rows: Any, nodes: NDArray[Any]) -> Any:
-    if isinstance(rows, dict):
-        return {key: _taken(each, nodes) for key, each in rows.items()}
-    if isinstance(rows, tuple):
-        return tuple(_taken(each, nodes) for each in rows)
-    return None if rows is None else rows[nodes]
-
-
-def _own(space: gym.Space[Any], rows: Any) -> NDArray[Any] | None:
-    """What `observation=own` shows: an array, of a Dict its `image`, of a Tuple of numbers these."""
-    if isinstance(space, spaces.Dict):
-        return rows.get("image") if isinstance(rows.get("image"), np.ndarray) else None
-    if isinstance(space, spaces.Tuple):
-        is_numbers = all(isinstance(each, spaces.Discrete) for each in space.spaces)
-        return np.stack(rows, axis=1).astype(np.int64) if is_numbers and len(rows) else None
-    return rows if isinstance(rows, np.ndarray) else None
+def _action_names(search: Search) -> list[str] | None:
+    """The names in an enumeration `actions`, if the environment has one that fits."""
+    actions = getattr(search.env.unwrapped, "actions", None)
+    if not isinstance(actions, EnumType):
+        return None
+    names = {member.value: member.name for member in actions}  # type: ignore[var-annotated]
+    numbers = range(search.num_actions)
+    return [names[number] for number in numbers] if names.keys() >= set(numbers) else None

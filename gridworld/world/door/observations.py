@@ -1,0 +1,80 @@
+"""Observations as a learner gets them: arrays of the types of their space."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from gridworld.base.errors import InputError, on_a_line
+
+
+def leaves(observation: Any, space: gym.Space[Any], refusal: Callable[[str], InputError]) -> Iterator[Any]:
+    """The arrays in an observation, each of the type of its space; bytes of what is none."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        inner = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        for key, each in inner:
+            try:
+                part = observation[key]
+            except (TypeError, KeyError, IndexError):
+                raise _misfit(observation, space, refusal) from None
+            yield from leaves(part, each, refusal)
+    elif isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        try:
+            given = np.asarray(observation)
+            array: NDArray[Any] = given.astype(space.dtype, order="C")
+            fits = given.shape == space.shape and given.dtype.kind in "biuf"
+            if fits and given.dtype != array.dtype and not (array == given).all():
+                fits = np.allclose(array.astype(np.float64), given.astype(np.float64), 1e-3, 1e-6, True)
+            if isinstance(space, spaces.Discrete):
+                fits = fits and bool(space.start <= array < space.start + space.n)
+        except (TypeError, ValueError, OverflowError):
+            fits = False
+        if not fits:
+            raise _misfit(observation, space, refusal)
+        yield array
+    else:
+        try:
+            yield pickle.dumps(observation)
+        except Exception:
+            raise _misfit(observation, space, refusal) from None
+
+
+def _misfit(observation: Any, space: gym.Space[Any], refusal: Callable[[str], InputError]) -> InputError:
+    return refusal(
+        f"an observation is {on_a_line(observation)}, which is not in its space {on_a_line(space)}"
+    )
+
+
+def stacked(space: gym.Space[Any], parts: Any) -> Any:
+    """Observations as arrays of all states, from an iterator over the leaves of a space; None for others."""
+    if isinstance(space, spaces.Dict):
+        return {key: stacked(each, parts) for key, each in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(stacked(each, parts) for each in space.spaces)
+    found = next(parts)
+    return None if isinstance(found[0], bytes) else np.stack(found)
+
+
+def taken(rows: Any, states: NDArray[Any]) -> Any:
+    """The rows of some states, of what `stacked` makes."""
+    if isinstance(rows, dict):
+        return {key: taken(each, states) for key, each in rows.items()}
+    if isinstance(rows, tuple):
+        return tuple(taken(each, states) for each in rows)
+    return None if rows is None else rows[states]
+
+
+def own_array(space: gym.Space[Any], rows: Any) -> NDArray[Any] | None:
+    """What `observation=own` shows: an array, of a Dict its `image`, of a Tuple of numbers these."""
+    if isinstance(space, spaces.Dict):
+        return rows.get("image") if isinstance(rows.get("image"), np.ndarray) else None
+    if isinstance(space, spaces.Tuple):
+        is_numbers = all(isinstance(each, spaces.Discrete) for each in space.spaces)
+        return np.stack(rows, axis=1).astype(np.int64) if is_numbers and len(rows) else None
+    return rows if isinstance(rows, np.ndarray) else None
