@@ -122,7 +122,7 @@ def _task(env: Any, **bounds: Any) -> Task:
     if callable(env):
         return _made(env, **bounds)
     raise InputError(
-        f"env: {type(env).__name__} is no environment; must be an environment or a batch of Gymnasium or "
+        f"env: {type(env).__name__} is not an environment; must be an environment or a batch of Gymnasium or "
         "SB3, a class "
         "or a function that makes one, a compiled world, or a world's name"
     )

@@ -205,7 +205,11 @@ def test_the_score_of_a_table_is_what_it_earns_through_wrappers(world: str, kind
         table = rng.integers(actions, size=states)
         score = gridworld.evaluate(table, env)
         mean, error = played(env, lambda seen, table=table: int(table[seen]), episodes)
-        assert agrees(score, mean, error), (score, mean, error)
+        assert agrees(score, mean, error or 0.001 * is_random), (
+            score,
+            mean,
+            error,
+        )  # rare ends may be missed
     if world == "lake":
         vectors = [DummyVecEnv([lambda: env]), SyncVectorEnv([lambda: env])]
         assert all(gridworld.evaluate(table, batch) == score for batch in vectors)

@@ -152,7 +152,7 @@ def test_a_run_is_scored_on_its_own_world() -> None:
             lambda: gridworld.compile_env(make_vec_env("CartPole-v1", 1)),
             "its states are continuous",
         ),
-        (lambda: gridworld.compile_env(3), "env: int is no environment"),
+        (lambda: gridworld.compile_env(3), "env: int is not an environment"),
         (lambda: gridworld.compile_env(gym.make("Taxi-v4", fickle_passenger=True)), "fickle_passenger=True"),
         (lambda: gridworld.compile_mdp("classic"), "layout='classic': must be a Layout; load"),  # type: ignore[arg-type]
         (lambda: gridworld.make_vec("FrozenLake"), "mdp=FrozenLake: must be a compiled world"),
@@ -304,7 +304,7 @@ def refused(*given: Any, **named: Any) -> str:
         (([1] * 30, "classic"), {"gamma": "x"}, "gamma=x: must be a number"),
         (("runs/a",), {}, r"runs/a is a path; open the run with open_run"),
         (([1] * 30, "nope"), {}, "env=nope: no such world"),
-        (([1] * 30, 3), {}, "env: int is no environment"),
+        (([1] * 30, 3), {}, "env: int is not an environment"),
         (([1] * 30, "classic"), {"gamma": 2}, "gamma=2: must be from 0 to 1"),
         (([1] * 30, "classic"), {"max_episode_steps": 0}, "max_episode_steps"),
     ],

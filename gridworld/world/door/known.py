@@ -77,17 +77,17 @@ def is_kept(kind: type) -> bool:
     return _is_kept(kind, _loaded(_KEPT))
 
 
-def _hand(env: Any) -> Any:
-    """Blackjack's player: all that its rules read is the sum, an ace, and where it matters a natural."""
-    is_natural = (env.sab or env.natural) and sorted(env.player) == [1, 10]
-    return env.dealer, sum(env.player), 1 in env.player, is_natural
+def _hands(env: Any) -> Any:
+    """Blackjack's hands: all that its rules read of one is the sum, an ace, and whether it is a natural."""
+    hands = [(sum(hand), 1 in hand, sorted(hand) == [1, 10]) for hand in (env.dealer, env.player)]
+    return env.dealer[:1], *hands
 
 
 def state_reader(env: Any) -> Callable[[Any], Any] | None:
     """What the state of a known environment is, where its attributes hold more than matters."""
     kind: Any = getattr(sys.modules.get("gymnasium.envs.toy_text.blackjack"), "BlackjackEnv", None)
     is_blackjack = kind is not None and type(env) is kind
-    return _hand if is_blackjack else None
+    return _hands if is_blackjack else None
 
 
 @contextmanager

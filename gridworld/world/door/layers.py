@@ -244,6 +244,10 @@ class Layers:
         """A copy of every attribute, and of `more`; what cannot be copied raises whatever it raises."""
         return self._dump([*more, *(attributes(layer) for layer in self.layers)], self.fixed)
 
+    def copy_of(self, thing: Any) -> bytes:
+        """A copy of something that may hold the layers."""
+        return self._dump(thing)
+
     def names(self) -> list[str]:
         """The names of all attributes."""
         return [name for layer in self.layers for name in attributes(layer)]

@@ -42,6 +42,11 @@ class _Again(BaseException):  # which an environment's `except Exception` does n
         self.place = place
 
 
+class _Known(BaseException):
+    def __init__(self, place: Any) -> None:
+        self.place = place
+
+
 class Rejecting(Branching):
     """A generator that takes every outcome, and knows a rejection when it comes again.
 
@@ -49,19 +54,25 @@ class Rejecting(Branching):
         where: what messages call the environment.
         everything: a copy of all attributes and of what it is given.
         runs: the code of the functions that run a reset or a step.
+        remembers: whether what follows a draw in a loop is found once, wherever the same comes again.
     """
 
-    def __init__(self, where: str, everything: Callable[..., bytes], runs: Iterable[CodeType]) -> None:
+    def __init__(
+        self, where: str, everything: Callable[..., bytes], runs: Iterable[CodeType], remembers: bool = False
+    ) -> None:
         super().__init__(where)
         self._everything, self._runs = everything, frozenset(runs)
         self._depth, self._begun = 0, dict[Any, int]()
         self.sampling: np.random.Generator | None = None  # draws, in place of taking every outcome
         self._takes_all = False  # no draw counts as a rejection
         self._compared: Counter[Any] = Counter()
-        self.has_rejected = False  # anywhere
+        self._remembers = remembers
+        self._known: dict[Any, dict[Any, Fraction]] = {}  # what follows a draw, if it remembers
 
     def outcomes(self, step: Callable[[], Result]) -> dict[Result, Fraction]:
         """The different results of a step, each with its probability."""
+        if self._remembers:
+            return self._folded(step)[0]
         try:
             return super().outcomes(step)
         except _Again:
@@ -73,7 +84,6 @@ class Rejecting(Branching):
                 return super().outcomes(step)
             finally:
                 self._takes_all = False
-        self.has_rejected = True
         return found
 
     def first(self, step: Callable[[], Result]) -> Result:
@@ -104,6 +114,8 @@ class Rejecting(Branching):
         if self.sampling is not None:
             return getattr(self.sampling, name)(*arguments, **options)
         if not self._depth and not self._takes_all and (place := self._place_of(name)) is not None:
+            if place in self._known:
+                raise _Known(place)
             first = self._begun.setdefault(place, self._place)
             if first < self._place:
                 raise _Again(first)
@@ -141,36 +153,47 @@ class Rejecting(Branching):
         """Outcomes where what a loop rejects is shared out among what it takes; and where it rejects."""
         self._decisions, self._taken = [], []
         leaves: list[Leaf] = []
-        places = set()
+        places, begun = set(), dict[Any, tuple[int, int]]()  # of each draw its decision, and its first leaf
         for _ in range(MOST_BRANCHES):
-            result: Any
+            result: dict[Any, Fraction]
             try:
-                result = self._ran(step), None
+                result = {(self._ran(step),): Fraction(1)}
             except _Again as again:
-                result = again.place
-                self._is_running = False
+                result = {again.place: Fraction(1)}
                 places |= {key[0] for key, first in self._begun.items() if first == again.place}
                 del self._decisions[self._place :], self._taken[self._place :]
+            except _Known as known:
+                result = self._known[known.place]
+                del self._decisions[self._place :], self._taken[self._place :]
+            for place, first in self._begun.items():
+                begun.setdefault(place, (first, len(leaves)))
             decisions = zip(self._decisions, self._taken, strict=True)
-            leaves.append(
-                (
-                    [(tuple(each.weights[n] for n in each.possible), taken) for each, taken in decisions],
-                    result,
-                )
-            )
+            steps = [(tuple(each.weights[n] for n in each.possible), taken) for each, taken in decisions]
+            leaves.append((steps, result))
             while self._taken and self._taken[-1] + 1 == len(self._decisions[-1].possible):
                 self._taken.pop()
                 self._decisions.pop()
+            if self._remembers:
+                self._remember(begun, leaves)
             if not self._taken:
-                return {result[0]: share for result, share in self._fold(leaves, 0).items()}, frozenset(
-                    places
-                )
+                found = self._fold(leaves, 0)
+                return {result[0]: share for result, share in found.items()}, frozenset(places)
             self._taken[-1] += 1
         raise InputError(f"{self._where}: one step has more than {MOST_BRANCHES:,} random outcomes")
 
+    def _remember(self, begun: dict[Any, tuple[int, int]], leaves: list[Leaf]) -> None:
+        """Keep what follows the draws all of whose outcomes have been taken."""
+        for place, (first, leaf) in [*begun.items()]:
+            if first >= len(self._taken) and len(leaves[leaf][0]) > first:
+                found = self._fold(leaves[leaf:], first)
+                if all(isinstance(result, tuple) for result in found):
+                    self._known[place] = found
+                del begun[place]
+
     def _fold(self, leaves: list[Leaf], depth: int) -> dict[Any, Fraction]:
         if len(leaves[0][0]) == depth:
-            return {leaves[0][1]: Fraction(1)}
+            found: dict[Any, Fraction] = leaves[0][1]
+            return found
         groups: dict[int, list[Leaf]] = {}
         for leaf in leaves:
             groups.setdefault(leaf[0][depth][1], []).append(leaf)

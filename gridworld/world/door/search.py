@@ -42,6 +42,7 @@ _SAMPLED = 16  # of so many states the copy of one is kept, to name what keeps c
 _WALKS, _WALK = 20, 10  # walks that show which large attributes change, and their steps
 _FACING = ("right", "down", "left", "up")  # minigrid's directions
 _MOST_RESETS = 1_000  # that lead to other states than usual; more will not turn out to be alike
+_FEW_STARTS = 256  # of more, every outcome of a reset is tried from the first and the last state only
 _LONGEST_NAME = 60  # of a state that is called by its observation
 _OLD_API = (
     "as in the old Gym: reset(self, *, seed=None, options=None) must return (observation, info), and step "
@@ -138,7 +139,7 @@ class Search:
 
     def _explored(self, counts_time: bool) -> None:
         runs = (Search.reset_from.__code__, Search.stepped_from.__code__)
-        self.branching = Rejecting(self.where, lambda *held: self.layers.everything(*held), runs)
+        self.branching = Rejecting(self.where, self._everything, runs, self._read is not None)
         self.layers = layers = Layers(self.where, self.env, self.branching, counts_time)
         self._is_complete = counts_time  # nothing that an environment may read is left out
         with layers.restored():
@@ -170,6 +171,12 @@ class Search:
                         continuous = "its states are continuous, and only finite worlds have an exact optimum"
                         raise self.refusal(f"{continuous} ({str(error).partition(': ')[2]})") from None
                     raise
+
+    def _everything(self, *held: Any) -> bytes:
+        """All that a step's rest depends on, with what the functions between hold."""
+        if self._read is None:
+            return self.layers.everything(*held)
+        return self.layers.copy_of((self._read(self.layers.base), held))
 
     def walk(self, kind: type) -> list[Any]:
         """What some walks with numpy's own generator and actions of a type show."""
@@ -315,9 +322,10 @@ class Search:
             self.layers.put(state.copy)
             if self._mask() != state.mask:
                 raise self.refusal("its action_masks() does not always allow the same in the same state")
-        if state.number.bit_count() <= 1:  # 0, 1, 2, 4, 8 ...
-            self._check_resets(state.copy)
+        if is_marked := state.number.bit_count() <= 1:  # 0, 1, 2, 4, 8 ...
             self.layers.check_left()
+        if is_marked and (len(self.starts) <= _FEW_STARTS or not state.number):
+            self._check_resets(state.copy)
         else:
             self._check_first_reset(state.copy)
         while self._waiting_ends:

@@ -147,7 +147,7 @@ class _World:
         found = {each.mask or everything for each in self._possible(node)} or {everything}
         if len(found) > 1 or any(len(each) != self.search.num_actions for each in found):
             raise self.search.refusal(
-                "action_masks() tells apart what the observations do not, or has not one entry for each "
+                "action_masks() depends on what the observations do not show, or has not one entry for each "
                 "of its "
                 f"{self.search.num_actions} actions; show what it depends on"
             )

@@ -453,7 +453,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "a count without end": (Endless, "count"),
     "no environment": (lambda: 3, "it makes a int; must be a gymnasium.Env"),
     "a failing constructor": (lambda: 1 / 0, r"cannot make an environment \(ZeroDivisionError"),
-    "nothing at all": (3, "int is no environment"),
+    "nothing at all": (3, "int is not an environment"),
 }
 
 
