@@ -22,6 +22,7 @@ from gymnasium import spaces
 
 from gridworld.base.errors import in_short
 from gridworld.world.door.layers import GENERATORS, contents, random_states, state_of
+from gridworld.world.door.observations import content
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 Env = gym.Env[Any, Any]
@@ -118,18 +119,6 @@ def generators_restored() -> Iterator[None]:
         np.random.set_state(states[1])
 
 
-def seen(observation: Any) -> bytes:
-    """The content of an observation, to compare it."""
-    if isinstance(observation, dict):
-        return b"{%b}" % b",".join(repr(key).encode() + seen(each) for key, each in observation.items())
-    if isinstance(observation, tuple | list):
-        return b"(%b)" % b",".join(map(seen, observation))
-    array = np.asarray(observation)
-    if array.dtype == object:
-        return repr(observation).encode()
-    return repr((array.shape, array.dtype.str)).encode() + array.tobytes()
-
-
 def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
     """Take about so many steps, with one seed for everything."""
     random.seed(seed)
@@ -155,17 +144,17 @@ def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
         taken = 0
         try:
             observation, _ = env.reset(seed=seed if episode == 0 else None)
-            key = seen(observation)
+            key = content(observation)
             for taken, action in enumerate(actions.of_episode(episode)):
                 before = number(observation, key)
                 states = _states(generators) if len(rows) < _WATCHED else None
                 after, reward, terminated, truncated, _ = env.step(copy.copy(action))
                 if states is not None:
                     draws |= states != _states(generators)
-                    changed += seen(observation) != key
-                observation, key = after, seen(after)
+                    changed += content(observation) != key
+                observation, key = after, content(after)
                 ends = bool(terminated), bool(truncated)
-                act = acts.setdefault(seen(action), len(acts))
+                act = acts.setdefault(content(action), len(acts))
                 row = (episode, taken, before, act, float(reward), number(after, key), *ends)
                 rows.append((*row, episode % 2 == 0))
                 if any(ends) or taken + 1 >= LONGEST:
@@ -240,10 +229,10 @@ def _play(env: Env, actions: Sequence[Any], seed: int, shared: tuple[int, int]) 
     random.seed(shared[0])
     np.random.seed(shared[1])
     observation, _ = env.reset(seed=seed)
-    found: Play = [(seen(observation), 0.0, False, False)]
+    found: Play = [(content(observation), 0.0, False, False)]
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(copy.copy(action))
-        found.append((seen(observation), float(reward), bool(terminated), bool(truncated)))
+        found.append((content(observation), float(reward), bool(terminated), bool(truncated)))
         if terminated or truncated:
             break
     return found

@@ -57,6 +57,11 @@ def is_neutral(layer: Any) -> bool:
     )
 
 
+def records(layer: Any) -> bool:
+    """Whether a neutral wrapper adds to the `info` of a step."""
+    return isinstance(layer, (wrappers.RecordEpisodeStatistics, *_loaded(_NEUTRAL_ELSEWHERE)))
+
+
 def is_limit(layer: Any) -> bool:
     """Whether a wrapper is Gymnasium's time limit."""
     return type(layer) is wrappers.TimeLimit and "step" not in vars(layer) and "reset" not in vars(layer)

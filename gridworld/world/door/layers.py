@@ -75,6 +75,35 @@ class Limited(gym.Wrapper[Any, Any, Any, Any]):
         raise Timed
 
 
+class _Told(dict[str, Any]):
+    """The `info` of a step, below a wrapper that may look for what a recording adds to it."""
+
+    def __contains__(self, key: object) -> bool:
+        if key == "episode":
+            raise InputError(
+                "env: a wrapper reads info['episode'] of a recording below it, which is left out; let it "
+                "sum up "
+                "what it needs itself"
+            )
+        return super().__contains__(key)
+
+    def __getitem__(self, key: str) -> Any:
+        if key in self:
+            return super().__getitem__(key)
+        raise KeyError(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        return super().__getitem__(key) if key in self else default
+
+
+class _Recorded(gym.Wrapper[Any, Any, Any, Any]):
+    """Stands for a recording (Monitor, RecordEpisodeStatistics) below a wrapper with a step of its own."""
+
+    def step(self, action: Any) -> Any:
+        *shown, info = self.env.step(action)
+        return *shown, _Told(info)
+
+
 class Layers:
     """The layers of an environment, the outermost first, and copies of what they hold.
 
@@ -102,6 +131,8 @@ class Layers:
             elif not known.is_neutral(layer):
                 self.layers.append(layer)
                 chain.append(layer)
+            elif known.records(layer) and not all(map(known.steps_once, self.layers)):
+                chain.append(_Recorded(layer.env))
         self._chain = chain  # without the neutral ones
         self.may_see_cuts = self.limited is not None and not all(map(known.steps_once, self.layers[:-1]))
         self.env: Any = self.layers[0]

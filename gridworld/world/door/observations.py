@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -39,10 +38,21 @@ def leaves(observation: Any, space: gym.Space[Any], refusal: Callable[[str], Inp
             raise _misfit(observation, space, refusal)
         yield array
     else:
-        try:
-            yield pickle.dumps(observation)
-        except Exception:
-            raise _misfit(observation, space, refusal) from None
+        yield content(observation)
+
+
+def content(thing: Any) -> bytes:
+    """The content of an observation of any kind, to compare it."""
+    if isinstance(thing, dict):
+        return b"{%b}" % b",".join(repr(key).encode() + content(each) for key, each in thing.items())
+    if isinstance(thing, set | frozenset):
+        return b"<%b>" % b",".join(sorted(map(content, thing)))
+    if isinstance(thing, tuple | list):
+        return b"(%b)" % b",".join(map(content, thing))
+    array = np.asarray(thing)
+    if array.dtype == object:
+        return repr(thing).encode()
+    return repr((array.shape, array.dtype.str)).encode() + array.tobytes()
 
 
 def _misfit(observation: Any, space: gym.Space[Any], refusal: Callable[[str], InputError]) -> InputError:

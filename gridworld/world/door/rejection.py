@@ -17,6 +17,7 @@ import linecache
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from fractions import Fraction
 from types import CodeType, FrameType
 from typing import Any
@@ -37,9 +38,22 @@ Leaf = tuple[
 ]  # the decisions of a run (weights, taken), and its result
 
 
+Way = tuple[int, tuple[int, ...]]  # to a draw: how many decisions were taken before, and which
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Stands among results for a draw that comes again, with the way to where it was met."""
+
+    place: Any
+    way: Way
+
+
 class _Again(BaseException):  # which an environment's `except Exception` does not catch
-    def __init__(self, place: int) -> None:
-        self.place = place
+    """A draw at which everything is as at one that was met before: what follows it is known."""
+
+    def __init__(self, place: Any, way: Way) -> None:
+        self.place = _Place(place, way)
 
 
 class _Known(BaseException):
@@ -62,7 +76,14 @@ class Rejecting(Branching):
     ) -> None:
         super().__init__(where)
         self._everything, self._runs = everything, frozenset(runs)
-        self._depth, self._begun = 0, dict[Any, int]()
+        self._depth = 0
+        self._met: dict[Any, Way] = {}  # of each draw in a loop, the way to it
+        # Whether a draw that was met on another way counts as having come again, where a loop begins anew.
+        self._across = False
+        self._seen, self._head = (
+            set[Any](),
+            None,
+        )  # where this run has drawn; the first place where it did twice
         self.sampling: np.random.Generator | None = None  # draws, in place of taking every outcome
         self._takes_all = False  # no draw counts as a rejection
         self._compared: Counter[Any] = Counter()
@@ -71,42 +92,48 @@ class Rejecting(Branching):
 
     def outcomes(self, step: Callable[[], Result]) -> dict[Result, Fraction]:
         """The different results of a step, each with its probability."""
+        self._met, self._across = {}, self._remembers
         if self._remembers:
-            return self._folded(step)[0]
+            return self._merged(step)[0]
         try:
             return super().outcomes(step)
         except _Again:
             pass
-        found, places = self._folded(step)
-        if self._differs(step, found, places):
-            self._takes_all = True
-            try:
-                return super().outcomes(step)
-            finally:
-                self._takes_all = False
-        return found
+        for self._across in (True, False):  # the first is faster, and misled by what is on the stack
+            found, places = self._merged(step)
+            if not self._differs(step, found, (self._across, places)):
+                return found
+        self._takes_all = True
+        try:
+            return super().outcomes(step)
+        finally:
+            self._takes_all = False
 
     def first(self, step: Callable[[], Result]) -> Result:
         """The result of a step in which every draw has its first outcome that is not rejected."""
-        self._decisions, self._taken = [], []
+        self._decisions, self._taken, self._met, self._across = [], [], {}, False
         while True:
             try:
                 return self._ran(step)
-            except _Again as again:
+            except (_Again, _Known):
                 del self._decisions[self._place :], self._taken[self._place :]
-                self._next(again.place)
+                if not self._next():
+                    raise self._endless() from None
 
-    def _next(self, first: int) -> None:
-        """Go on to the next outcome of the last draw from `first` on that has one."""
-        while len(self._taken) > first and self._taken[-1] + 1 == len(self._decisions[-1].possible):
+    def _endless(self) -> InputError:
+        return InputError(f"{self._where}: a loop draws again without end, since nothing ever fits")
+
+    def _next(self) -> bool:
+        """Go on to the next outcome of the last draw that has one; whether there is any."""
+        while self._taken and self._taken[-1] + 1 == len(self._decisions[-1].possible):
             self._taken.pop()
             self._decisions.pop()
-        if len(self._taken) <= first:
-            raise InputError(f"{self._where}: a loop draws again without end, since nothing ever fits")
-        self._taken[-1] += 1
+        if self._taken:
+            self._taken[-1] += 1
+        return bool(self._taken)
 
     def _ran(self, step: Callable[[], Result]) -> Result:
-        self._begun, self._depth = {}, 0
+        self._depth, self._seen, self._head = 0, set(), None
         return super()._ran(step)
 
     def drawn(self, name: str, *arguments: Any, **options: Any) -> Any:
@@ -116,9 +143,14 @@ class Rejecting(Branching):
         if not self._depth and not self._takes_all and (place := self._place_of(name)) is not None:
             if place in self._known:
                 raise _Known(place)
-            first = self._begun.setdefault(place, self._place)
-            if first < self._place:
-                raise _Again(first)
+            way = self._place, tuple(self._taken[: self._place])
+            if self._head is None and place[0] in self._seen:
+                self._head = place[0]
+            self._seen.add(place[0])
+            met, may_be = self._met.setdefault(place, way), self._across and place[0] == self._head
+            if met != way and (may_be or way[1][: met[0]] == met[1]):
+                raise _Again(place, met)
+            self._met[place] = way
         self._depth += 1
         try:
             return getattr(Branching, name)(self, *arguments, **options)
@@ -149,51 +181,66 @@ class Rejecting(Branching):
     def _is_plain(code: CodeType, at: int, name: str) -> bool:
         return not _in_for(code, at) and _calls(code, at, name)
 
-    def _folded(self, step: Callable[[], Any]) -> tuple[dict[Any, Fraction], Any]:
-        """Outcomes where what a loop rejects is shared out among what it takes; and where it rejects."""
-        self._decisions, self._taken = [], []
+    def _merged(self, step: Callable[[], Any]) -> tuple[dict[Any, Fraction], Any]:
+        """Outcomes where what comes again counts as what it was; and the places where draws came again.
+
+        From each draw that comes again on, the shares are a linear system: of results, and of such draws.
+        """
+        self._decisions, self._taken, self._met = [], [], {}
         leaves: list[Leaf] = []
-        places, begun = set(), dict[Any, tuple[int, int]]()  # of each draw its decision, and its first leaf
+        again = set[_Place]()
         for _ in range(MOST_BRANCHES):
             result: dict[Any, Fraction]
             try:
                 result = {(self._ran(step),): Fraction(1)}
-            except _Again as again:
-                result = {again.place: Fraction(1)}
-                places |= {key[0] for key, first in self._begun.items() if first == again.place}
+            except _Again as error:
+                result = {error.place: Fraction(1)}
+                again.add(error.place)
                 del self._decisions[self._place :], self._taken[self._place :]
-            except _Known as known:
-                result = self._known[known.place]
+            except _Known as error:
+                result = self._known[error.place]
                 del self._decisions[self._place :], self._taken[self._place :]
-            for place, first in self._begun.items():
-                begun.setdefault(place, (first, len(leaves)))
             decisions = zip(self._decisions, self._taken, strict=True)
-            steps = [(tuple(each.weights[n] for n in each.possible), taken) for each, taken in decisions]
-            leaves.append((steps, result))
-            while self._taken and self._taken[-1] + 1 == len(self._decisions[-1].possible):
-                self._taken.pop()
-                self._decisions.pop()
-            if self._remembers:
-                self._remember(begun, leaves)
-            if not self._taken:
-                found = self._fold(leaves, 0)
-                return {result[0]: share for result, share in found.items()}, frozenset(places)
-            self._taken[-1] += 1
-        raise InputError(f"{self._where}: one step has more than {MOST_BRANCHES:,} random outcomes")
+            way = [(tuple(each.weights[n] for n in each.possible), taken) for each, taken in decisions]
+            leaves.append((way, result))
+            if not self._next():
+                break
+        else:
+            raise InputError(f"{self._where}: one step has more than {MOST_BRANCHES:,} random outcomes")
+        if self._remembers:
+            again |= {_Place(place, way) for place, way in self._met.items()}
+        follows = {place: self._following(leaves, place.way) for place in again}
+        whole = self._fold(leaves, 0)
+        for place in follows:
+            self._substitute(place, follows, whole)
+        if self._remembers:
+            self._known |= {place.place: found for place, found in follows.items()}
+        return {result[0]: share for result, share in whole.items()}, frozenset(
+            each.place[0] for each in again
+        )
 
-    def _remember(self, begun: dict[Any, tuple[int, int]], leaves: list[Leaf]) -> None:
-        """Keep what follows the draws all of whose outcomes have been taken."""
-        for place, (first, leaf) in [*begun.items()]:
-            if first >= len(self._taken) and len(leaves[leaf][0]) > first:
-                found = self._fold(leaves[leaf:], first)
-                if all(isinstance(result, tuple) for result in found):
-                    self._known[place] = found
-                del begun[place]
+    def _following(self, leaves: list[Leaf], way: Way) -> dict[Any, Fraction]:
+        """What follows a draw, by the way to it."""
+        depth, taken = way
+        return self._fold([each for each in leaves if tuple(t for _, t in each[0][:depth]) == taken], depth)
+
+    def _substitute(
+        self, place: _Place, follows: dict[_Place, dict[Any, Fraction]], whole: dict[Any, Fraction]
+    ) -> None:
+        """Put what follows a draw in its place, everywhere."""
+        found = follows[place]
+        back = found.pop(place, Fraction(0))
+        if back == 1:
+            raise self._endless()
+        found = follows[place] = {result: share / (1 - back) for result, share in found.items()}
+        for other in (whole, *follows.values()):
+            if other is not found and (share := other.pop(place, None)) is not None:
+                for result, part in found.items():
+                    other[result] = other.get(result, Fraction(0)) + share * part
 
     def _fold(self, leaves: list[Leaf], depth: int) -> dict[Any, Fraction]:
         if len(leaves[0][0]) == depth:
-            found: dict[Any, Fraction] = leaves[0][1]
-            return found
+            return dict(leaves[0][1])
         groups: dict[int, list[Leaf]] = {}
         for leaf in leaves:
             groups.setdefault(leaf[0][depth][1], []).append(leaf)
@@ -202,10 +249,7 @@ class Rejecting(Branching):
             weights = group[0][0][depth][0]
             for result, part in self._fold(group, depth + 1).items():
                 whole[result] = whole.get(result, Fraction(0)) + Fraction(weights[taken], sum(weights)) * part
-        rejected = whole.pop(depth, Fraction(0))
-        if rejected == 1:
-            raise InputError(f"{self._where}: a loop draws again without end, since nothing ever fits")
-        return {result: part / (1 - rejected) for result, part in whole.items()}
+        return whole
 
     def _differs(self, step: Callable[[], Any], expected: dict[Any, Fraction], places: Any) -> bool:
         """Whether real draws are not as frequent as their shares; a false alarm once in 1e9."""

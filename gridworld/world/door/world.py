@@ -208,7 +208,14 @@ def _own_limit(search: Search) -> int | None:
     if not truncated[True]:
         return search.limit_met
     limit = min(truncated[True])
-    if max(truncated[False], default=0) >= limit:
+    is_timed = all(
+        search.states[step.following].depth == state.depth + 1
+        for state in search.states
+        for row in state.steps
+        for step in row
+        if step.following >= 0
+    )
+    if not is_timed or max(truncated[False], default=0) >= limit:  # a state must have one time
         raise search.refusal(NO_LIMIT)
     return limit
 

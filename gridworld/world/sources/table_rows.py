@@ -29,18 +29,25 @@ Shares = dict[Any, Fraction]
 
 
 def compare_rows(mdp: Mdp, table: Outcomes, real: Env) -> bool:
-    """Refuse an environment that does not follow its table; False: its state `s` cannot be set."""
+    """Refuse who does not follow its table; False: `s` is not all of its state, or cannot be set."""
     branching = Rejecting(mdp.name, bytes, ())
     layers = Layers(mdp.name, real, branching)
+    known = {"s", "lastaction"} if type(real).step.__module__.startswith("gymnasium.envs.") else {"s"}
     with layers.restored():
+        before, found, mistake = layers.values(), False, None
         try:
             found = _Rows(mdp, table, layers.base, branching).compare()
-        except InputError:
-            raise
+        except InputError as error:
+            mistake = error
         except Exception as error:  # it may raise anything
             raise InputError(f"{mdp.name}: cannot be stepped ({in_short(error)})") from error
         finally:
             layers.check_generators()
+        after = layers.values()
+    if {name for (_, name) in before | after if before.get((0, name)) != after.get((0, name))} - known:
+        return False  # it holds more than the number of its state
+    if mistake is not None:
+        raise mistake
     return found
 
 

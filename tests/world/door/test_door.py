@@ -8,6 +8,7 @@ import numpy as np
 import pygame
 import pytest
 from gymnasium import spaces, wrappers
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.utils import seeding
 from gymnasium.vector import SyncVectorEnv
 from stable_baselines3 import PPO
@@ -411,6 +412,74 @@ def test_batches_are_one_task_or_refused() -> None:
         gridworld.compile_env(DummyVecEnv([lambda: Rooms(4), lambda: Rooms(5)]))
 
 
+class Tired(FrozenLakeEnv):
+    """Has a table, and pays for the fifth time that it goes from 4 to 8 after 0 to 4."""
+
+    def reset(self, **given: Any) -> Any:
+        self.n = 0
+        return super().reset(**given)
+
+    def step(self, action: Any) -> Any:
+        before = self.s
+        observation, reward, *rest = super().step(action)
+        self.n += before == 0 and observation == 4
+        return observation, reward + 9.0 * (before == 4 and observation == 8 and self.n >= 5), *rest
+
+
+class Fuel(FrozenLakeEnv):
+    """Has a table, and ends when its fuel is used up."""
+
+    def reset(self, **given: Any) -> Any:
+        self.fuel = 8
+        return super().reset(**given)
+
+    def step(self, action: Any) -> Any:
+        observation, reward, over, *rest = super().step(action)
+        self.fuel -= 1
+        return observation, reward, over or self.fuel == 0, *rest
+
+
+def test_a_table_is_a_shortcut_only_where_it_is_all_of_the_state() -> None:
+    tired = gridworld.compile_env(wrappers.TimeLimit(Tired(is_slippery=False), 12))
+    assert Evaluator(tired, 0.95, 12).optimal_value >= 9 * 0.95**9
+    fuel = gridworld.compile_env(Fuel(is_slippery=False))
+    assert Evaluator(fuel, 0.95, 100).optimal_value == pytest.approx(0.95**5)
+
+
+class Cut(Line):
+    """Truncates in a place, not at a time."""
+
+    def step(self, action: int) -> Result:
+        self.at = 0 if self.at == 2 and action else self.at + 1
+        return self.at, float(self.at == 0), False, self.at == 3, {}
+
+
+class Twins(Line):
+    """Shows two equal numbers, which are one object or two; what is paid depends on which."""
+
+    observation_space: gym.Space[Any] = spaces.Sequence(spaces.Discrete(100_000))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        gym.Env.reset(self, seed=seed)
+        self.coin, number = int(self.np_random.integers(2)), np.int64(70_000)
+        return (number, number if self.coin else np.int64(70_000)), {}
+
+    def step(self, action: int) -> Result:
+        return (np.int64(1),), float(action == self.coin), True, False, {}
+
+
+def test_equal_observations_are_one_whatever_they_are_made_of() -> None:
+    assert optimum(Twins()) == 0.5
+
+
+class Sparse(gym.Wrapper[Any, Any, Any, Any]):
+    """Pays what a recording below it has summed up."""
+
+    def step(self, action: Any) -> Any:
+        observation, _, *over, info = self.env.step(action)
+        return observation, float(info["episode"]["r"]) if "episode" in info else 0.0, *over, info
+
+
 class IntOnly(Line):
     def step(self, action: int) -> Result:
         return super().step(1 if type(action) is int and action else 0)
@@ -451,6 +520,8 @@ REFUSED: dict[str, tuple[Any, str]] = {
         r"step\(\) returns .* as in the old Gym: .* \(observation, reward, termin",
     ),
     "a count without end": (Endless, "count"),
+    "a cut that is not at a time": (Cut, "truncates some episodes earlier than others"),
+    "a recording that is read": (lambda: Sparse(Monitor(Line())), r"reads info\['episode'\] of a recording"),
     "no environment": (lambda: 3, "it makes a int; must be a gymnasium.Env"),
     "a failing constructor": (lambda: 1 / 0, r"cannot make an environment \(ZeroDivisionError"),
     "nothing at all": (3, "int is not an environment"),

@@ -40,6 +40,26 @@ class Until(Paying):
         return die
 
 
+class Kept(Paying):
+    """Each number that is rejected stays in a variable, so that no two tries look alike."""
+
+    def draw(self) -> Any:
+        while True:
+            number = int(self.np_random.integers(25))
+            if number >= 20:
+                return number
+
+
+class Cells(Paying):
+    """Two draws a try."""
+
+    def draw(self) -> Any:
+        row, column = -1, -1
+        while row == column or row + column > 3:
+            row, column = self.np_random.integers(4), self.np_random.integers(4)
+        return 10 * row + column
+
+
 class InFor(Paying):
     """A count in an iterator, which nobody sees."""
 
@@ -156,6 +176,8 @@ class OnTheStack(Paying):
 COUNTS = {0: "1/2", 1: "1/4", 2: "1/8", 3: "1/8"}
 SHARES: dict[type[Paying], dict[float, str]] = {
     Until: dict.fromkeys(range(1, 6), "1/5"),
+    Kept: dict.fromkeys(range(20, 25), "1/5"),
+    Cells: dict.fromkeys((1, 2, 3, 10, 12, 20, 21, 30), "1/8"),
     InFor: {0: "1/9", 1: "2/9", 2: "1/3", 3: "2/9", 4: "1/9"},
     Mapped: {0: "1/9", 1: "2/9", 2: "1/3", 3: "2/9", 4: "1/9"},
     Bisected: {0: "3/4", 1: "1/8", 2: "1/8"},
