@@ -137,7 +137,7 @@ def redrawn(self, **kwargs):
 @pytest.mark.parametrize(
     ("method", "other", "told"),
     [
-        ("reset", redrawn, "does not follow its own table|its table P changes"),
+        ("reset", redrawn, "a reset does not always lead to the same state"),
         ("step", lambda self, a: (*TableEnv.step(self, a)[:3], True, {}), "truncates its own episodes"),
         ("reset", lambda self, **_: (1, {}), "the start in state . occurs with a probability of"),
         ("step", lambda self, action: 1 / 0, "cannot be stepped .*ZeroDivisionError: division"),
@@ -145,8 +145,8 @@ def redrawn(self, **kwargs):
     ],
 )
 def test_an_environment_that_is_not_its_table_is_refused(method, other, told):
-    with pytest.raises(InputError, match=f"^Odd: .*({told})"):
-        compile_table(type("Odd", (TableEnv,), {method: other})())
+    with pytest.raises(InputError, match=told):
+        compile_env(type("Odd", (TableEnv,), {method: other})())
 
 
 def test_the_wrappers_of_an_id_belong_to_its_world():
