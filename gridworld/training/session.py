@@ -186,18 +186,17 @@ class Session:
 
     def _on_safe_point(self, steps: int) -> None:
         """Save if it is time for it; nothing is half done here."""
-        asked = self._stop.number is not None
+        asked = self._stop.number is not None  # a signal that arrives from here on waits for the next safe point
         is_last = steps >= self._config.total_timesteps
-        if not (asked or is_last or self._pace.is_due(steps)) or steps == self.checkpoints.newest:
+        if (asked or is_last or self._pace.is_due(steps)) and steps != self.checkpoints.newest:
+            started = time.perf_counter()
+            try:
+                self._save(steps, is_last)
+            except OSError as error:
+                _log.warning("%s: no checkpoint after step %s, %s", self._run.folder, steps, error.strerror)
+            self._pace.took(steps, time.perf_counter() - started)
+        if asked:
             self._stop.obey()
-            return
-        started = time.perf_counter()
-        try:
-            self._save(steps, is_last)
-        except OSError as error:
-            _log.warning("%s: no checkpoint after step %s, %s", self._run.folder, steps, error.strerror)
-        self._pace.took(steps, time.perf_counter() - started)
-        self._stop.obey()
 
     def _save(self, steps: int, is_last: bool) -> None:
         # A short run is over before a disk has anything, and waits for it at its end only (see `_settle`).

@@ -293,6 +293,29 @@ def test_a_signal_saves_and_ends_soon(
     assert list((tmp_path / "run").rglob("*.part")) == []
 
 
+STOPPED_BETWEEN = """
+import os, signal, sys
+from gridworld.commands import call
+from gridworld.run.checkpoints import Pace
+is_due = Pace.is_due
+def sending(pace, steps):
+    if steps >= 64:  # after the safe point has asked whether a signal came
+        os.kill(os.getpid(), signal.SIGTERM)
+    return is_due(pace, steps)
+Pace.is_due = sending
+call("train")
+"""
+
+
+def test_a_signal_between_two_questions_of_a_safe_point_loses_nothing(tmp_path: Path) -> None:
+    words = ("agent=a2c", "total_timesteps=10000", "evaluation.every=32", "hydra.run.dir=run")
+    command = [sys.executable, "-c", STOPPED_BETWEEN, *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 128 + signal.SIGTERM, done.stderr
+    left = manifest(tmp_path / "run")
+    assert left["checkpoint"] == left["reached"] > 64  # type: ignore[operator]
+
+
 STOPPED_EARLY = """
 import os, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it
