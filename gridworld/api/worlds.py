@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from os import PathLike
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from gymnasium.spaces import Discrete
@@ -13,11 +15,18 @@ from numpy.typing import ArrayLike
 from gridworld.base.bounds import discount
 from gridworld.base.errors import InputError, on_a_line
 from gridworld.config.compose import named_world
+from gridworld.config.worlds import is_id
 from gridworld.envs.inspection import Task, task_of, world_of
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.world.chain import as_numbers, policy_of_table
+from gridworld.world.door.search import MOST_SECONDS, MOST_STATES
 from gridworld.world.evaluation import Evaluator, PolicySnapshot, Score
+from gridworld.world.grid import GridMdp
+from gridworld.world.grid import compile_mdp as compiled_map
+from gridworld.world.layout import Layout
 from gridworld.world.mdp import FloatArray, Mdp
+from gridworld.world.sources.environment import make_env
+from gridworld.world.sources.gymnasium_table import mdp_of_table
 
 
 def evaluate(
@@ -132,19 +141,31 @@ def _by_states(task: Task, numbers: FloatArray) -> FloatArray:
     return np.asarray(numbers[mdp.number]) if is_by_number else numbers
 
 
-def compile_env(env: Any) -> Mdp:
+def compile_env(
+    env: Any,
+    *,
+    state: Callable[[Any], Any] | None = None,
+    ignore: Sequence[str] = (),
+    most_states: int = MOST_STATES,
+    most_seconds: float = MOST_SECONDS,
+) -> Mdp:
     """Compile an environment into the tables of its world. The environment is left as it is.
 
     Args:
         env: an environment of Gymnasium with all its wrappers, a class or a function that makes one, or a
-        batch
-            of Gymnasium or SB3. A GridWorld, and one with a transition table that its steps follow
-            (`P` and `initial_state_distrib`: FrozenLake, CliffWalking, Taxi), is known; of any other, every
-            action is tried in a copy of every state. Or a name: what `env=NAME` means on a command line, or
-            an id of Gymnasium.
+            batch of Gymnasium or SB3. A GridWorld, and one with a transition table that its steps follow
+            (`P`: FrozenLake, CliffWalking, Taxi), is known; of any other, every action is tried in a copy of
+            every state. Or a name: what `env=NAME` means on a command line, an id of Gymnasium, or
+            `module:NAME`.
+        state: a function of the environment without wrappers that returns all that matters of its state, by
+            your word; None: what the attributes of all layers hold.
+        ignore: names of attributes that are not part of its state, by your word.
+        most_states: a search that finds more is refused.
+        most_seconds: a search that takes longer is refused.
 
     Returns:
-        The world, with the environment's step limit as `max_episode_steps`; a GridWorld's own world.
+        The world, with the environment's step limit as `max_episode_steps`; a GridWorld's own world. Its
+        `truth` says how the tables are known.
 
     Raises:
         InputError: its states are too many or continuous, it does not follow its own table, or it depends on
@@ -156,7 +177,64 @@ def compile_env(env: Any) -> Mdp:
         >>> mdp.name, mdp.num_states, mdp.action_names, mdp.max_episode_steps
         ('FrozenLake-v1', 16, ('left', 'down', 'right', 'up'), 100)
     """
-    return named_world(env) if isinstance(env, str) else world_of(env)
+    if isinstance(env, str) and not is_id(env):
+        if ignore or state is not None:
+            raise InputError(f"env={env}: is a world with tables of its own; leave out state= and ignore=")
+        return named_world(env)
+    if isinstance(ignore, str):
+        raise InputError(f"ignore={ignore!r}: must be a list of names, [{ignore!r}]")
+    given = partial(make_env, env) if isinstance(env, str) else env
+    bounds = {"most_states": most_states, "most_seconds": most_seconds}
+    return world_of(given, state=state, ignore=ignore, **bounds)
+
+
+@overload
+def compile_mdp(
+    layout: Layout,
+    slip: float = ...,
+    step_reward: float = ...,
+    goal_reward: float = ...,
+    trap_reward: float = ...,
+) -> GridMdp: ...
+
+
+@overload
+def compile_mdp(
+    layout: Mapping[int, Any] | Sequence[Any], slip: ArrayLike = ..., *, start: ArrayLike = ...
+) -> Mdp: ...
+
+
+def compile_mdp(
+    layout: Any,
+    slip: Any = 0.0,
+    step_reward: float = 0.0,
+    goal_reward: float = 1.0,
+    trap_reward: float = -1.0,
+    *,
+    start: Any = None,
+) -> Mdp:
+    """Compile a map and its rewards, or a transition table, into a world.
+
+    Args:
+        layout: the map; or a table `P`, as environments of Gymnasium have it: `P[state][action]` is a list of
+            (probability, next state, reward, terminated), of N states and A actions, numbered from 0.
+        slip: of a map, the probability that a move goes to one side instead; of a table, `start`.
+        step_reward: of every step, on a map.
+        goal_reward: of entering a goal.
+        trap_reward: of entering a trap or a cliff.
+        start: of a table, (N,) probabilities, or one state.
+
+    Raises:
+        InputError: a setting or a table that makes no world.
+
+    Example:
+        >>> stay, leave, over = [(1.0, 0, 0.0, False)], [(1.0, 1, 1.0, True)], [(1.0, 1, 0.0, True)]
+        >>> compile_mdp({0: {0: stay, 1: leave}, 1: {0: over, 1: over}}, start=0)
+        <Mdp P: 2 states, 2 actions>
+    """
+    if isinstance(layout, Mapping | list | tuple):
+        return mdp_of_table(layout, slip if start is None else start)
+    return compiled_map(layout, slip, step_reward, goal_reward, trap_reward)
 
 
 def make_vec(mdp: Mdp, num_envs: int = 1, **kwargs: Any) -> GridWorldVectorEnv:

@@ -9,6 +9,11 @@ from pathlib import Path
 from typing import Any
 
 EXIT_CODE = 2
+GYMNASIUM = (  # the interface of an environment
+    "reset(self, *, seed=None, options=None) must return (observation, info), and step "
+    "(observation, reward, terminated, truncated, info)"
+)
+OLD_GYM = f"is written for the old Gym: write `import gymnasium as gym`; {GYMNASIUM}"
 DISTRIBUTION = "gridworld-sb3"  # the package's name for pip; on PyPI another project has `gridworld`
 
 

@@ -15,17 +15,22 @@ import os
 import re
 import stat
 import struct
+import sys
 import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from importlib import import_module
+from importlib.machinery import PathFinder
+from importlib.util import module_from_spec, spec_from_file_location
 from os import PathLike
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from gridworld.base.errors import InputError, install_command
+from gridworld.base.errors import OLD_GYM, InputError, install_command
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -160,18 +165,58 @@ def npz_arrays(
         raise InputError(f"{where}: not {kind} that can be read ({reason})") from None
 
 
+def named_object(where: str, name: str) -> Any:
+    """What `module:NAME` or `folder/module.py:NAME` names, where a person typed it; None: no such name.
+
+    The module may be in the current folder.
+    """
+    place, _, attribute = name.rpartition(":")
+    file = (users_folder() / place).resolve() if place.endswith(".py") else None
+    if file is not None and not file.is_file():
+        raise InputError(f"{where}={name}: no file {place}; give module:NAME or folder/module.py:NAME")
+    folder = str(users_folder() if file is None else file.parent)
+    if folder not in sys.path:
+        sys.path.append(folder)  # as the last, so that nothing that is installed is hidden
+    importlib.invalidate_caches()
+    return _named(f"{where}={name}", place if file is None else file.stem, attribute, file)
+
+
 def imported(where: str, path: Any) -> Any:
     """Import what a path in the setting `where` names; None where its module has no such name."""
     module, _, name = str(path).rpartition(".")
+    return _named(f"{where}={path}", module, name)
+
+
+def _named(where: str, module: str, name: str, file: Path | None = None) -> Any:
     try:
-        return getattr(importlib.import_module(module), name, None)
+        return getattr(import_module(module) if file is None else _of_file(module, file), name, None)
     except ModuleNotFoundError as error:
         if error.name in _EXTRAS:
             package, extra = _EXTRAS[error.name]
-            raise InputError(f"{where}={path}: needs {package}; {install_command(extra)}") from None
-        raise InputError(f"{where}={path}: no module {error.name}; is its folder on PYTHONPATH?") from None
+            raise InputError(f"{where}: needs {package}; {install_command(extra)}") from None
+        missing = f"no module {error.name}; install it, or add its folder to PYTHONPATH"
+        raise InputError(f"{where}: {OLD_GYM if error.name == 'gym' else missing}") from None
     except (ValueError, TypeError):  # no path at all
         return None
     except (Exception, SystemExit) as error:  # a module of the user's own may raise anything
         what = f"{module} cannot be imported ({type(error).__name__}: {error})"
-        raise InputError(f"{where}={path}: {what}") from error
+        raise InputError(f"{where}: {what}") from error
+
+
+def _of_file(name: str, file: Path) -> ModuleType:
+    """The module in a file, by its own name unless that is another module's."""
+    spec = sys.modules[name].__spec__ if name in sys.modules else PathFinder.find_spec(name)
+    if spec is not None and spec.origin == str(file):
+        return import_module(name)
+    name = f"{name}_{zlib.crc32(bytes(file)):08x}"
+    if name not in sys.modules:
+        spec = spec_from_file_location(name, file)
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[name] = module_from_spec(spec)
+        try:
+            spec.loader.exec_module(sys.modules[name])
+        except BaseException:
+            del sys.modules[name]
+            raise
+    return sys.modules[name]

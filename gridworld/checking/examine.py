@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import re
 import textwrap
 import time
 import warnings
@@ -19,18 +18,18 @@ from gymnasium.utils.env_checker import check_env
 from gridworld.base.bounds import STEP_LIMIT, Bounds, discount
 from gridworld.base.console import aligned
 from gridworld.base.errors import InputError, in_short
-from gridworld.base.user_input import imported
 from gridworld.checking.function import SingleEnv
 from gridworld.checking.sampling import Actions, Env, Replays, generators_restored, replays, sample
 from gridworld.checking.seen import ERROR, EnvFinding, Seen
 from gridworld.checking.symptoms import ALL
 from gridworld.config.compose import named_world
+from gridworld.config.worlds import is_id
 from gridworld.envs.inspection import task_of
 from gridworld.envs.observations import make_observation
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.world.mdp import Mdp
 from gridworld.world.metrics import wilson_interval
-from gridworld.world.sources.environment import make_env, step_limit
+from gridworld.world.sources.environment import as_environment, make_env, step_limit
 
 _STEPS = 20_000
 _MOST_STATES = 3_000  # to enumerate
@@ -126,14 +125,9 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
 def _subject(env: Any) -> tuple[str, Make, Mdp | None]:
     """What to call an environment, how to make it, and its tables if it is a compiled world."""
     if isinstance(env, str):
-        module, colon, name = env.partition(":")
-        if colon and (found := imported("examine", f"{module}.{name}")) is not None:
-            return env, found, None
-        if re.search(r"-v\d+$", env):
+        if is_id(env):
             make_env(env).close()
             return env, lambda: make_env(env), None
-        if colon:
-            raise InputError(f"examine {env}: the module {module} has no {name}, nor is that a registered id")
         env = named_world(env)
     if isinstance(env, Mdp):
         limit, seen = env.max_episode_steps or STEP_LIMIT, make_observation(env, "none")
@@ -158,9 +152,9 @@ def _made(name: str, make: Make) -> Env:
     try:
         env = make()
     except Exception as error:  # anybody's code
-        raise InputError(f"examine {name}: cannot be made ({in_short(error)})") from error
-    if not isinstance(env, gym.Env):
-        raise InputError(f"examine {name}: makes a {type(env).__name__}, must be a gymnasium.Env")
+        reason = str(error) if isinstance(error, InputError) else f"cannot be made ({in_short(error)})"
+        raise InputError(f"examine {name}: {reason}") from error
+    as_environment(f"examine {name}", env)
     for what in ("observation_space", "action_space"):
         if not isinstance(getattr(env, what, None), spaces.Space):
             raise InputError(f"examine {name}: its {what} is not a gymnasium space")

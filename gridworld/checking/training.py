@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gridworld.agents import Agent, TrainingContext
 from gridworld.agents.sb3.settings import SB3ClassConfig, SB3Config
 from gridworld.base.errors import InputError
-from gridworld.base.user_input import imported
+from gridworld.base.user_input import named_object
 from gridworld.checking.function import OBSERVATIONS, FunctionConfig
 from gridworld.checking.probes import Probe, Trained
 from gridworld.config.train import AgentConfig
@@ -122,7 +122,7 @@ def _arguments_of(kind: type) -> list[str]:
 def subject(algorithm: Any, observation: str = "state") -> AgentConfig:
     """The settings of a train function, a class with SB3's interface or a shipped agent, also by name."""
     if isinstance(algorithm, str) and ":" in algorithm:
-        found = imported("check", algorithm.replace(":", "."))
+        found = named_object("check", algorithm)
         if not callable(found):
             raise InputError(f"check {algorithm}: must be a function, as module:function")
         return dataclasses.replace(subject(found, observation), name=algorithm)

@@ -29,7 +29,7 @@ from gridworld.config.settings import agent_schemas
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SearchConfig, SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import conf_folder, is_override, meant, own_conf_folders, prepared, sentence
-from gridworld.config.worlds import SOURCES, EnvConfig, GymnasiumConfig, MapConfig
+from gridworld.config.worlds import SOURCES, EnvConfig, GymnasiumConfig, MapConfig, is_id
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
     from gridworld.world.mdp import Mdp
@@ -70,12 +70,15 @@ def named_world(name: str, **settings: Any) -> Mdp:
     names = sorted(path.stem for path in (conf_folder() / "env").glob("*.yaml"))
     if name in names:
         env = compose([f"env={name}"]).env
-    elif re.search(r"-v\d+$", name):
+    elif is_id(name):
         env = GymnasiumConfig(id=name)
     elif name.endswith(".txt"):
         env = MapConfig(layout=name)
     else:
-        all_of_them = f"; give a Gymnasium id such as FrozenLake-v1, a map file, or one of {', '.join(names)}"
+        all_of_them = (
+            "; give a Gymnasium id such as FrozenLake-v1, module:NAME of a class or a function, a map "
+            f"file, or one of {', '.join(names)}"
+        )
         raise InputError(f"env={name}: no such world{meant(name, names) or all_of_them}")
     known = {field.name for field in dataclasses.fields(env)} - {"source"}
     if wrong := sorted(set(settings) - known):

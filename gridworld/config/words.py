@@ -19,7 +19,7 @@ from gridworld.base.errors import InputError, failure
 from gridworld.config.fields import MISSING
 from gridworld.config.settings import all_settings, settings_of_a_run, takes_whole_numbers
 from gridworld.config.train import AgentConfig
-from gridworld.config.worlds import EnvConfig
+from gridworld.config.worlds import EnvConfig, is_id
 
 OF_THE_COMMAND = ("experiment", "recipe", "resume", "trust", "anyway")  # words that look like settings
 _FLOAT = re.compile(r"(?<![\w.$'\"])[-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.'\"])")
@@ -102,6 +102,8 @@ def is_override(words: Sequence[str], index: int) -> bool:
 def prepared(words: Sequence[str], own: Sequence[Path] = ()) -> list[str]:
     """A command line as Hydra takes it: 1e5 as 100000, experiment=ENV_AGENT as the choice of the two.
 
+    An environment by its id, or by the name of its class, is the choice env=gymnasium with that id.
+
     There may be recipes in the folders of `--config-dir` too, which are `own`.
     """
     found: list[str] = []
@@ -110,6 +112,9 @@ def prepared(words: Sequence[str], own: Sequence[Path] = ()) -> list[str]:
         key, _, value = word.partition("=")
         if key[:1] == "~" and key[1:] in settings_of_a_run():
             raise InputError(f"{word}: a setting cannot be taken away; give it a value, {key[1:]}=...")
+        if key == "env" and all(map(is_id, value.split(","))):
+            found += ["env=gymnasium", f"env.id={value}"]
+            continue
         if key == "tuned" and "hydra.searchpath" not in chosen:
             _check_recipe(value, [conf_folder(), *own])
         if key.lstrip("+") == "experiment" and value in pairs():
@@ -228,24 +233,12 @@ def _unknown_choice(message: str) -> str:
     if where == "experiment":
         choices = sorted({*choices, *pairs()})
     fact = f"{where}={name}: no such choice"
-    if where == "env" and re.search(r"-v\d+$", name):
-        word = f"env=gymnasium env.id={_current_id(name)}"
-        return f"{fact}; for a Gymnasium environment, write {word}{meant(name, choices)}"
     if len(choices) <= _LISTED:
         return f"{fact}; choose from {', '.join(choices)}{meant(name, choices)}"
     near = [choice for choice in choices if choice.startswith(name)]
     near = near or difflib.get_close_matches(name, choices)
     hint = f"; close matches: {', '.join(near)}" if near else ""
     return f"{fact}{hint}; --help lists them all"
-
-
-def _current_id(name: str) -> str:
-    """The id of the newest version of an environment of Gymnasium."""
-    from gymnasium.envs.registration import find_highest_version, get_env_id, parse_env_id
-
-    space, plain, _ = parse_env_id(name)
-    newest = find_highest_version(space, plain)
-    return name if newest is None else get_env_id(space, plain, newest)
 
 
 def _suggestion(facts: str, message: str, error: BaseException) -> str:

@@ -7,6 +7,7 @@ A schema is the section `env` of a run's settings. To add a source, add a schema
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,7 +15,18 @@ from typing import TYPE_CHECKING, Any
 
 from gridworld.base.bounds import MOST_STEPS, STEP_LIMIT
 from gridworld.base.errors import InputError
-from gridworld.config.fields import MISSING, BuilderPath, EnvId, FilePath, Kwargs, Word, bounds, setting
+from gridworld.config.fields import (
+    MISSING,
+    BuilderPath,
+    Effect,
+    EnvId,
+    FilePath,
+    Kwargs,
+    Word,
+    affects,
+    bounds,
+    setting,
+)
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
     from gridworld.world.grid import GridMdp
@@ -89,12 +101,19 @@ class GymnasiumConfig(EnvConfig):
     """
 
     source: Word = "gymnasium"
-    id: EnvId = MISSING  # that it is registered under, e.g. FrozenLake-v1
-    kwargs: Kwargs = field(default_factory=dict)  # of gymnasium.make
+    # that it is registered under, e.g. FrozenLake-v1; or module:NAME of a class or a function that makes one
+    id: EnvId = MISSING
+    kwargs: Kwargs = field(default_factory=dict)  # of gymnasium.make, the class or the function
+    # attributes that are not part of its state, by your word
+    ignore: list[Word] = field(default_factory=list)
+    # a search that finds more, or takes longer, is refused
+    most_states: int = setting(200_000, affects(Effect.NOTHING), bounds(1, 512 * 512))
+    most_seconds: float = setting(120, affects(Effect.NOTHING), bounds(0, 86_400, above=True))
 
     @property
     def name(self) -> str:
-        return self.id
+        place, colon, name = self.id.rpartition(":")
+        return f"{Path(place).stem if place.endswith('.py') else place}{colon}{name}"
 
     @property
     def compiles_quickly(self) -> bool:
@@ -108,7 +127,11 @@ class GymnasiumConfig(EnvConfig):
     def compile(self) -> Mdp:
         from gridworld.world.sources.environment import compile_id
 
-        return compile_id(self.id, self.kwargs)
+        return compile_id(self.id, self.kwargs, **self._bounds(), by_table=not self.ignore)
+
+    def _bounds(self) -> dict[str, Any]:
+        """What bounds a search, and what it leaves out."""
+        return {"ignore": self.ignore, "most_states": self.most_states, "most_seconds": self.most_seconds}
 
     def step_limit(self, mdp: Mdp) -> int:
         limit, own = super().step_limit(mdp), mdp.max_episode_steps
@@ -126,13 +149,11 @@ class EnumeratedConfig(GymnasiumConfig):
     """An environment of Gymnasium whose states are found by trying all actions and random draws."""
 
     source: Word = "enumerated"
-    # attributes that are not part of its state, by your word
-    ignore: list[Word] = field(default_factory=list)
 
     def compile(self) -> Mdp:
-        from gridworld.world.sources.environment import enumerate_env
+        from gridworld.world.sources.environment import compile_id
 
-        return enumerate_env(self.id, self.kwargs, ignore=self.ignore)
+        return compile_id(self.id, self.kwargs, **self._bounds(), by_table=False)
 
 
 @dataclass
@@ -234,6 +255,11 @@ def _compiled(
     from gridworld.world.grid import compile_mdp
 
     return compile_mdp(layout, slip, step_reward, goal_reward, trap_reward)
+
+
+def is_id(text: str) -> bool:
+    """Whether a text has the form of an environment's name, as in `GymnasiumConfig.id`."""
+    return re.search(r"(-v\d+|[\w.]:[A-Za-z_]\w*)$", text) is not None
 
 
 def compiled(env: EnvConfig) -> Mdp:

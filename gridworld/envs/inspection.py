@@ -33,7 +33,7 @@ from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import Layout, load
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import verified
-from gridworld.world.sources.environment import found_by, found_of, shortcut, step_limit
+from gridworld.world.sources.environment import as_environment, found_by, found_of, shortcut, step_limit
 
 # What a batch is, by the class whose methods it runs.
 _GYMNASIUM, _SB3 = "gymnasium.wrappers.vector", "stable_baselines3.common.vec_env"
@@ -107,9 +107,9 @@ def task_of(env: Any, max_episode_steps: int | None = None, **bounds: Any) -> Ta
     return replace(task, max_episode_steps=limit)
 
 
-def world_of(env: Any) -> Mdp:
+def world_of(env: Any, **bounds: Any) -> Mdp:
     """The world of an environment or a batch, with its step limit."""
-    task = _task(env)
+    task = _task(env, **bounds)
     mdp, limit = task.mdp, task.own_limit
     return mdp if limit in (None, mdp.default_step_limit) else replace(mdp, max_episode_steps=limit)
 
@@ -118,13 +118,16 @@ def _task(env: Any, **bounds: Any) -> Task:
     if isinstance(env, gym.Env):
         return _single(env, **bounds)
     if isinstance(env, gym.vector.VectorEnv) or hasattr(env, "step_wait"):
-        return _batch(env)
+        return _batch(env, **bounds)
     if callable(env):
         return _made(env, **bounds)
-    raise InputError(
-        f"env: {type(env).__name__} is not an environment; must be an environment or a batch of Gymnasium or "
-        "SB3, a class "
-        "or a function that makes one, a compiled world, or a world's name"
+    return _single(
+        as_environment(
+            "env",
+            env,
+            "an environment or a batch of Gymnasium or SB3, a class or a function that makes one, a compiled "
+            "world, or a world's name",
+        )
     )
 
 
@@ -137,20 +140,22 @@ def _made(make: Any, **bounds: Any) -> Task:
         except Exception as error:  # it may raise anything
             name = getattr(make, "__name__", type(make).__name__)
             raise InputError(f"env: {name}() cannot make an environment ({in_short(error)})") from error
-        if not isinstance(env, gym.Env):
-            raise InputError(f"env: it makes a {type(env).__name__}; must be a gymnasium.Env")
-        return env
+        return as_environment("env", env)
 
     with closing(made()) as env:
-        return _known(env) or _task_of_found(found_by(made, **bounds))
+        return _known(env, **bounds) or _task_of_found(found_by(made, **bounds))
 
 
 def _single(env: gym.Env[Any, Any], **bounds: Any) -> Task:
-    return _known(env) or _task_of_found(found_of(env, **bounds))
+    return _known(env, **bounds) or _task_of_found(found_of(env, **bounds))
 
 
-def _known(env: gym.Env[Any, Any]) -> Task | None:
+def _known(
+    env: gym.Env[Any, Any], ignore: Sequence[str] = (), state: Any = None, **bounds: Any
+) -> Task | None:
     """The task of an environment of ours, or of one with a table that its steps follow."""
+    if ignore or state is not None:  # what the user says is asked of the search
+        return None
     if (task := _ours(env)) is not None:
         return task
     if (mdp := shortcut(env)) is not None:
@@ -202,17 +207,17 @@ def known_class(thing: Any, table: dict[str, str], methods: Sequence[str]) -> st
     return None
 
 
-def _copies(batch: Any) -> Task:
+def _copies(batch: Any, **bounds: Any) -> Task:
     """The task of a batch's environments, which must be the same in all of them."""
     first, *others = batch.envs
     if len({id(each.unwrapped) for each in batch.envs}) < len(batch.envs):
         raise InputError(
             f"env: the {type(batch).__name__} contains the same environment twice; make a new one for each"
         )
-    task = _single(first)
+    task = _single(first, **bounds)
     same = traits(first) if others and task.is_found else None
     tasks = {
-        index: task if task.is_found and traits(other) == same else _single(other)
+        index: task if task.is_found and traits(other) == same else _single(other, **bounds)
         for index, other in enumerate(others, 1)
     }
 
@@ -250,7 +255,7 @@ def _rows(table: ObservationTable) -> Any:
     return table.stored if isinstance(table.stored, dict) else table.table()
 
 
-def _batch(env: Any) -> Task:
+def _batch(env: Any, **bounds: Any) -> Task:
     of_wrapper = ("observations",) if isinstance(env, gym.vector.VectorWrapper) else ()
     kind, name = known_class(env, _BATCHES, (*_DECISIVE, *of_wrapper)), type(env).__name__
     if kind is None:
@@ -264,14 +269,14 @@ def _batch(env: Any) -> Task:
             "inspected; give one such environment as env=..."
         )
     if kind == _COPIES:
-        return _copies(env)
+        return _copies(env, **bounds)
     if kind == _NATIVE:
         verified(env.mdp, "env")
         limit = env.step_limit if env.step_limit <= MOST_STEPS else None  # what it plays by
         return Task(env.mdp, limit, seen=lambda: make_observation(env.mdp, "none"))
     if kind == _OURS:
-        return replace(_batch(env.envs), seen=lambda: env.observation)
-    below = _batch(env.env if isinstance(env, gym.vector.VectorWrapper) else env.venv)
+        return replace(_batch(env.envs, **bounds), seen=lambda: env.observation)
+    below = _batch(env.env if isinstance(env, gym.vector.VectorWrapper) else env.venv, **bounds)
     if kind == _NEUTRAL:
         return below
     if kind == _TABLE:

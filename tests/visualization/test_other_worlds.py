@@ -44,7 +44,7 @@ from gridworld.world.layout import load
 from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.solver import value_iteration
-from gridworld.world.sources.environment import enumerate_env
+from gridworld.world.sources.environment import compile_id
 
 DIRECTIONS = {"up": (-1, 0), "right": (0, 1), "down": (1, 0), "left": (0, -1)}
 DIRECTIONS |= {"north": (-1, 0), "east": (0, 1), "south": (1, 0), "west": (0, -1)}
@@ -312,7 +312,7 @@ def test_an_environment_with_a_table_is_put_into_each_state(env_id, states, size
 
 def test_an_enumerated_environment_takes_the_same_walk():
     name, short = "MiniGrid-Empty-5x5-v0", {"max_steps": 12}
-    mdp = enumerate_env(name, short)
+    mdp = compile_id(name, short)
     env = gym.make(name, render_mode="rgb_array", **short)
     env.reset(seed=5)
     states, expected = [int(mdp.start_states[0])], [env.render()]

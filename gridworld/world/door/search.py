@@ -23,7 +23,7 @@ import numpy as np
 from gymnasium import spaces
 
 from gridworld.base.console import telling_if_slow
-from gridworld.base.errors import InputError, in_short, on_a_line
+from gridworld.base.errors import GYMNASIUM, InputError, in_short, on_a_line
 from gridworld.base.user_input import check_memory
 from gridworld.world.door import known
 from gridworld.world.door.beliefs import Step, lumped
@@ -44,10 +44,6 @@ _FACING = ("right", "down", "left", "up")  # minigrid's directions
 _MOST_RESETS = 1_000  # that lead to other states than usual; more will not turn out to be alike
 _FEW_STARTS = 256  # of more, every outcome of a reset is tried from the first and the last state only
 _LONGEST_NAME = 60  # of a state that is called by its observation
-_OLD_API = (
-    "as in the old Gym: reset(self, *, seed=None, options=None) must return (observation, info), and step "
-    "(observation, reward, terminated, truncated, info)"
-)
 _NOT_REPEATED = (
     "it does not repeat a walk with the same random numbers, so it depends on more than its attributes and "
     "np_random: another generator, a clock, a file, something global"
@@ -265,7 +261,7 @@ class Search:
         except Exception as error:  # whatever it raises
             raise self._failed("a reset", error) from error
         if not (isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[1], dict)):
-            raise self.refusal(f"reset() returns {on_a_line(returned)}, {_OLD_API}")
+            raise self.refusal(f"reset() returns {on_a_line(returned)}, as in the old Gym: {GYMNASIUM}")
         return *self.state_after(returned[0], 0), 0.0, False, False
 
     def stepped_from(self, copy: bytes, depth: int, action: Any) -> Result:
@@ -280,7 +276,7 @@ class Search:
         if limited is not None and limited.steps != 1:
             raise Timed
         if not (isinstance(returned, tuple) and len(returned) == 5):
-            raise self.refusal(f"step() returns {on_a_line(returned)}, {_OLD_API}")
+            raise self.refusal(f"step() returns {on_a_line(returned)}, as in the old Gym: {GYMNASIUM}")
         observation, reward, terminated, truncated, _ = returned
         if np.ndim(reward):
             raise self.refusal(

@@ -47,6 +47,7 @@ from gridworld.world.outcomes import (
     mdp_from_outcomes,
     verified,
 )
+from gridworld.world.sources.gymnasium_table import mdp_of_table
 
 _TABLES = ("next_state", "probability", "reward", "terminated", "success")
 _NEEDED = ("next_state", "reward", "terminated", "start")
@@ -103,7 +104,7 @@ def build(builder: str | Callable[..., Any], kwargs: Mapping[str, Any] | None = 
 
     Args:
         builder: the function, or its import path, `package.module.function`. It returns an `Mdp`, `Outcomes`,
-            or arrays by their names, as the module has them.
+            arrays by their names, as the module has them, or a table `P` and its start.
         kwargs: its arguments.
 
     Returns:
@@ -135,10 +136,13 @@ def _built(where: str, function: Callable[..., Any], kwargs: dict[str, Any]) -> 
         return verified(Mdp(**plain), where)
     if isinstance(found, Outcomes):
         return verified(dataclasses.replace(mdp_from_outcomes(where, found), name=name), where)
+    if isinstance(found, tuple) and len(found) == 2:
+        return mdp_of_table(*found, name)
     if isinstance(found, Mapping):
         return mdp_from_arrays(name, found, where)
     raise InputError(
-        f"{where}: returned {type(found).__name__}, must return an Mdp, Outcomes, or a mapping of arrays"
+        f"{where}: returned {type(found).__name__}, must return an Mdp, Outcomes, a mapping of arrays, or "
+        "(P, start) with a table P[state][action] of (probability, next state, reward, terminated)"
     )
 
 

@@ -7,7 +7,8 @@ A world here and a transition table are shortcuts: what they say is what trying 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from functools import partial
 from typing import Any
@@ -16,55 +17,49 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import seeding
 
-from gridworld.base.errors import InputError, in_short, install_command
+from gridworld.base.errors import OLD_GYM, InputError, in_short, install_command
+from gridworld.base.user_input import named_object
 from gridworld.world.door import known
 from gridworld.world.door.layers import Env, layers_of, random_states, state_of
 from gridworld.world.door.search import traits
 from gridworld.world.door.world import Found, enumerated
 from gridworld.world.mdp import Mdp
-from gridworld.world.outcomes import MOST_STATES
 from gridworld.world.sources.gymnasium_table import compile_table, has_table
 
 _IF_DRAWN = 40  # instances that are compared if making one draws random numbers
 
 
-def enumerate_env(
-    env_id: str,
-    kwargs: Mapping[str, Any] | None = None,
-    *,
-    ignore: Sequence[str] = (),
-    most_states: int = MOST_STATES,
+def compile_id(
+    env_id: str, kwargs: Mapping[str, Any] | None = None, *, by_table: bool = True, **bounds: Any
 ) -> Mdp:
-    """Compile an environment by trying every action in a copy of every state, with every draw of `np_random`.
+    """Compile an environment by its transition table if it has one that its steps follow, else by search.
 
     Args:
-        env_id: its registered id.
-        kwargs: the arguments of `gymnasium.make`.
-        ignore: attributes of the environment that are not part of its state.
-        most_states: more are refused as soon as they are found.
+        env_id: what `make_env` takes.
+        kwargs: the arguments of what makes it.
+        by_table: False: by search, even if it has a table.
+        bounds: of the search, see `enumerated`.
 
     Returns:
-        The world; its `truth` is "enumerated, N states", of what, and without which attributes. Its states
-        are what a history of observations and rewards leaves open of the environment's own, see `beliefs`.
+        The world; of a search, its `truth` is "enumerated, N states", of what, and without which attributes.
+        Its states are what a history of observations and rewards leaves open of the environment's own, see
+        `beliefs`.
     """
-    bounds = {"ignore": ignore, "most_states": most_states}
-    return found_by(partial(make_env, env_id, kwargs), f"env.id={env_id}", env_id, **bounds).mdp
-
-
-def compile_id(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Mdp:
-    """Compile an environment by its transition table if it has one that its steps follow, else by search."""
-    with closing(make_env(env_id, kwargs)) as env:
-        if (mdp := shortcut(env, env_id)) is None:
-            return found_by(partial(make_env, env_id, kwargs), f"env.id={env_id}", env_id).mdp
-        with closing(make_env(env_id, kwargs)) as again:
-            other = shortcut(again, env_id)
-        if other is None or other.digest() != mdp.digest():
-            raise InputError(
-                f"env.id={env_id}: has a different table each time it is made, so it cannot be solved "
-                "exactly; fix "
-                "it by env.kwargs, e.g. desc of a FrozenLake"
-            )
-        return mdp
+    make, where = partial(make_env, env_id, kwargs), f"env.id={env_id}"
+    mdp = None
+    if by_table:
+        with closing(make()) as env:
+            mdp = shortcut(env, env_id)
+    if mdp is None:
+        return found_by(make, where, env_id, **bounds).mdp
+    with closing(make()) as again:
+        other = shortcut(again, env_id)
+    if other is None or other.digest() != mdp.digest():
+        raise InputError(
+            f"{where}: has a different table each time it is made, so it cannot be solved exactly; fix it by "
+            "env.kwargs, e.g. desc of a FrozenLake"
+        )
+    return mdp
 
 
 def shortcut(env: gym.Env[Any, Any], name: str | None = None) -> Mdp | None:
@@ -121,47 +116,71 @@ def step_limit(env: gym.Env[Any, Any]) -> int | None:
     return min((each for each in limits if each > 0), default=None)
 
 
-def make_env(
-    env_id: str, kwargs: Mapping[str, Any] | None = None, render_mode: str | None = None
-) -> gym.Env[Any, Any]:
-    """Make an environment by its registered id; "module:id" imports the module first."""
-    arguments = dict(kwargs or {})
+def make_env(env_id: str, kwargs: Mapping[str, Any] | None = None, render_mode: str | None = None) -> Env:
+    """Make an environment by its registered id, or by the name of a class or a function that makes one.
+
+    "module:id" imports the module first; "module:NAME" and "folder/module.py:NAME" name what makes one.
+    """
+    env_id, arguments = str(env_id), dict(kwargs or {})
+    where = f"env.id={env_id[:80]}"
     if arguments.get("render_mode") is not None:
         raise InputError(
             f"env.kwargs: render_mode={arguments['render_mode']} is not part of the world; leave it out"
         )
-    module, _, registered = str(env_id).rpartition(":")
-    if module:
-        try:
-            importlib.import_module(module)
-        except (Exception, SystemExit) as error:  # it may raise anything
-            reason = f"the module {module} cannot be imported ({short_reason(error)})"
-            missing = error.name if isinstance(error, ModuleNotFoundError) else None
-            if missing and f"{module}.".startswith(f"{missing}."):
-                reason = f"no module {missing}; install it, or add its folder to PYTHONPATH"
-            raise InputError(f"env.id={str(env_id)[:80]}: {reason}") from None
-    if registered.startswith(("MiniGrid-", "BabyAI-")):
+    module, _, name = env_id.rpartition(":")
+    found = named_object("env.id", env_id) if module else None
+    if found is not None:
+        if not callable(found):
+            raise InputError(
+                f"{where}: is a {type(found).__name__}, must be a class or a function that makes one"
+            )
+        make: Callable[..., Any] = found
+    else:
+        make, defaults = _registered(where, env_id, name)
+        if render_mode is None and "render_mode" in defaults:
+            arguments["render_mode"] = None
+    if render_mode is not None:  # which not every class takes
+        arguments["render_mode"] = render_mode
+    try:
+        with np.errstate(all="ignore"):
+            return as_environment(where, make(**arguments))
+    except InputError:
+        raise
+    except Exception as error:  # as above
+        shown = ", ".join(f"{key}: {value}" for key, value in arguments.items())[:100]
+        given = f"env.kwargs={{{shown}}}: {env_id}" if arguments else f"{where}:"
+        raise InputError(f"{given} cannot be made ({short_reason(error)})") from None
+
+
+def _registered(where: str, env_id: str, name: str) -> tuple[Callable[..., Any], Mapping[str, Any]]:
+    """What makes an environment by its id, whose module is imported, and its arguments."""
+    if name.startswith(("MiniGrid-", "BabyAI-")):
         try:
             importlib.import_module("minigrid")  # registers them
         except ImportError:
             needed = f"needs the package minigrid; install it with {install_command('minigrid')}"
-            raise InputError(f"env.id={env_id}: {needed}") from None
+            raise InputError(f"{where}: {needed}") from None
     try:
-        spec = gym.spec(registered)
-    except Exception as error:  # an id may name a module, which may raise anything
+        spec = gym.spec(name)
+    except Exception as error:
+        module = env_id.rpartition(":")[0]
+        lacks = f"the module {module} has no {name}, nor is it registered" if module else "is not registered"
+        reason = f" ({short_reason(error)})" if re.search(r"-v\d+$", name) else ""
         raise InputError(
-            f"env.id={str(env_id)[:80]}: is not registered with Gymnasium ({short_reason(error)}); give a "
-            "registered id, e.g. FrozenLake-v1"
+            f"{where}: {lacks} with Gymnasium{reason}; give a registered id, e.g. FrozenLake-v1, or "
+            "module:NAME of a class or a function that makes an environment"
         ) from None
-    if render_mode is not None or "render_mode" in spec.kwargs:  # which not every class takes
-        arguments["render_mode"] = render_mode
-    try:
-        with np.errstate(all="ignore"):
-            return gym.make(env_id, **{"disable_env_checker": True, **arguments})
-    except Exception as error:  # as above
-        shown = ", ".join(f"{key}: {value}" for key, value in arguments.items())[:100]
-        given = f"env.kwargs={{{shown}}}: {env_id}" if arguments else f"env.id={env_id}:"
-        raise InputError(f"{given} cannot be made ({short_reason(error)})") from None
+    return partial(gym.make, name, disable_env_checker=True), spec.kwargs
+
+
+def as_environment(where: str, made: Any, wanted: str = "a gymnasium.Env") -> Env:
+    """What somebody's code made, which must be an environment of Gymnasium."""
+    if isinstance(made, gym.Env):
+        return made
+    is_old = any(kind.__module__.partition(".")[0] == "gym" for kind in type(made).__mro__)
+    kind = type(made).__name__
+    wrong = OLD_GYM if is_old else f"is not an environment; must be {wanted}"
+    raise InputError(f"{where}: {kind} {wrong}")
 
 
 def short_reason(error: BaseException) -> str:

@@ -3,7 +3,7 @@
 Environments of Gymnasium's `toy_text` family have a table `P` and a start distribution:
 
     P[state][action] = [(probability, next state, reward, terminated), ...]
-    initial_state_distrib = (N,) probabilities
+    initial_state_distrib = (N,) probabilities; isd in older ones
 
 Ending belongs to the outcome there; `gridworld.world.outcomes` makes it a state. An environment whose steps
 are not those of its table is refused: in each state every outcome of each action is tried (`table_rows`).
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError
 from gridworld.world.mdp import Mdp, grid_places
-from gridworld.world.outcomes import Outcomes, check_size, mdp_from_outcomes
+from gridworld.world.outcomes import Outcomes, check_size, mdp_from_outcomes, verified
 from gridworld.world.sources.table_rows import compare_rows
 
 FOLLOWED = "table P, which its steps follow exactly"  # the `truth` of such worlds
@@ -57,8 +57,23 @@ def compile_table(real: gym.Env[Any, Any], limit: int | None = None, name: str |
 
 
 def has_table(env: Any) -> bool:
-    """Whether an environment has a transition table."""
-    return getattr(env, "P", None) is not None
+    """Whether an environment has a transition table and says where it starts."""
+    return getattr(env, "P", None) is not None and _starts(env) is not None
+
+
+def _starts(env: Any) -> Any:
+    return getattr(env, "initial_state_distrib", getattr(env, "isd", None))
+
+
+def mdp_of_table(table: Any, start: Any, name: str = "P") -> Mdp:
+    """Compile a table `P` (see the module) of N states; `start` is (N,) probabilities, or one state."""
+    try:
+        size = len(table), len(table[0])
+    except (TypeError, LookupError):
+        size = 0, 0
+    if isinstance(start, int | np.integer) and 0 <= start < size[0]:
+        start = np.eye(size[0])[start]
+    return verified(mdp_from_outcomes(name, _outcomes(name, table, *size, start, "start")), name)
 
 
 def _compiled(real: gym.Env[Any, Any], name: str, limit: int | None) -> tuple[Mdp, Outcomes]:
@@ -85,9 +100,7 @@ def _compiled(real: gym.Env[Any, Any], name: str, limit: int | None) -> tuple[Md
 def _table(name: str, real: Any) -> Outcomes:
     """P and the start distribution as arrays; an outcome that a row does not have has probability 0."""
     if not has_table(real):
-        raise InputError(
-            f"{name}: has no transition table P; env=enumerated can find its states by trying all actions"
-        )
+        raise InputError(f"{name}: has no transition table P with a start distribution")
     sizes = []
     for what in ("observation", "action"):
         space = getattr(real, f"{what}_space", None)
@@ -95,15 +108,17 @@ def _table(name: str, real: Any) -> Outcomes:
             raise InputError(f"{name}: its {what} space is {space}, must be Discrete(n) that starts at 0")
         sizes.append(int(space.n))
     states, actions = sizes
-    rows = _rows(name, real.P, states, actions)
+    return _outcomes(name, real.P, states, actions, _starts(real), "initial_state_distrib")
+
+
+def _outcomes(name: str, table: Any, states: int, actions: int, given: Any, key: str) -> Outcomes:
+    rows = _rows(name, table, states, actions)
     try:
-        start = np.array(getattr(real, "initial_state_distrib", None), dtype=np.float64)
+        start = np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
         start = np.zeros(0)
     if start.shape != (states,):
-        raise InputError(
-            f"{name}: initial_state_distrib must be the {states} probabilities of starting in each state"
-        )
+        raise InputError(f"{name}: {key} must be the {states} probabilities of starting in each state")
     return Outcomes(
         next_state=rows[..., 1].astype(np.int64),
         probability=rows[..., 0].copy(),

@@ -522,7 +522,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "a count without end": (Endless, "count"),
     "a cut that is not at a time": (Cut, "truncates some episodes earlier than others"),
     "a recording that is read": (lambda: Sparse(Monitor(Line())), r"reads info\['episode'\] of a recording"),
-    "no environment": (lambda: 3, "it makes a int; must be a gymnasium.Env"),
+    "no environment": (lambda: 3, "int is not an environment; must be a gymnasium.Env"),
     "a failing constructor": (lambda: 1 / 0, r"cannot make an environment \(ZeroDivisionError"),
     "nothing at all": (3, "int is not an environment"),
 }

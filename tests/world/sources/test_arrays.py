@@ -403,7 +403,7 @@ def test_the_three_things_that_a_function_may_return():
         (
             "os.getcwd",
             None,
-            "env.builder=os.getcwd: returned str, must return an Mdp, Outcomes, or a mapping",
+            "env.builder=os.getcwd: returned str, must return an Mdp, Outcomes, a mapping",
         ),
         (raising, None, "env.builder=raising: raised RuntimeError: no power"),
         (raising, {"txt": 1}, "env.builder=raising: raised TypeError: .*unexpected keyword argument 'txt'"),

@@ -17,7 +17,7 @@ from gridworld.world.door import beliefs, known
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
-from gridworld.world.sources.environment import compile_id, enumerate_env
+from gridworld.world.sources.environment import compile_id
 
 GAMMA = 0.9
 
@@ -62,7 +62,7 @@ def compiled() -> Iterator[Callable[..., Mdp]]:
     def compile_class(kind: type[World], **kwargs: Any) -> Mdp:
         gym.register(f"{kind.__name__}-v0", entry_point=kind)
         made.append(f"{kind.__name__}-v0")
-        return enumerate_env(made[-1], **kwargs)
+        return compile_id(made[-1], **kwargs)
 
     yield compile_class
     for name in made:
@@ -195,9 +195,8 @@ def test_custom_environments_are_their_tables(compiled: Any, kind: Any, rows: An
     [("FrozenLake-v1", {}), ("FrozenLake-v1", {"desc": ["SFH", "FFG"]})],
 )
 def test_gymnasiums_environments_are_their_tables(env_id: str, kwargs: dict[str, Any]) -> None:
-    mdp = enumerate_env(
-        env_id, kwargs, ignore=["P", "lastaction"]
-    )  # which the steps do not change, or not read
+    ignore = ["P", "lastaction"]  # which the steps do not change, or not read
+    mdp = compile_id(env_id, kwargs, by_table=False, ignore=ignore)
     same_world(mdp, compile_id(env_id, kwargs))
     assert mdp.action_names == ("0", "1", "2", "3")
 
@@ -251,7 +250,7 @@ def test_blackjack_with_few_cards_is_as_good_as_by_its_rules(
 ) -> None:
     deck = [1, 7, 10, 10]
     monkeypatch.setattr(blackjack, "deck", deck)
-    mdp = enumerate_env("Blackjack-v1", {"sab": sab})
+    mdp = compile_id("Blackjack-v1", {"sab": sab})
     assert Evaluator(mdp, 1.0, 100).optimal_value == pytest.approx(cards(deck, sab), abs=1e-12)
     assert "beliefs about" in mdp.truth  # the dealer's second card is not seen
     # Where a natural wins, 21 with an ace is one observation of two states.

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gridworld.base.errors import InputError
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
-from gridworld.world.sources.environment import enumerate_env
+from gridworld.world.sources.environment import compile_id
 
 CELLS = 5
 MINIGRID, LIMIT = "MiniGrid-Empty-5x5-v0", 30
@@ -130,7 +130,7 @@ def _registered() -> Any:
 
 @pytest.fixture(scope="module")
 def empty() -> Mdp:
-    return enumerate_env(MINIGRID, {"max_steps": LIMIT})
+    return compile_id(MINIGRID, {"max_steps": LIMIT})
 
 
 def walk_beside(mdp: Mdp, env: gym.Env[Any, Any], steps: int, entry: str | None = None) -> int:
@@ -185,7 +185,7 @@ def test_the_optimum_of_minigrid_is_the_shortest_way_by_its_formula(empty: Mdp) 
 def test_any_deterministic_environment(variant: str, limit: int) -> None:
     kwargs = {"variant": variant, "limit": limit}
     env_id = "Corridor-v0" if limit else "ShortCorridor-v0"
-    mdp = enumerate_env(env_id, kwargs)
+    mdp = compile_id(env_id, kwargs)
     assert mdp.max_episode_steps == (limit or 12)
     walk_beside(mdp, gym.make(env_id, **kwargs), 500)
     best = {"plain": 1.0, "pixels": 1.0, "past": 1.0, "gate": 0.9**4, "decay": 0.9**4}[variant]
@@ -195,7 +195,7 @@ def test_any_deterministic_environment(variant: str, limit: int) -> None:
 @pytest.mark.parametrize("variant", ["plain", "pixels", "text"])
 @pytest.mark.parametrize("limit", [None, 30])
 def test_a_step_count_that_is_left_out(variant: str, limit: int | None) -> None:
-    mdp = enumerate_env("Corridor-v0", {"variant": variant, "limit": limit or 0}, ignore=["steps"])
+    mdp = compile_id("Corridor-v0", {"variant": variant, "limit": limit or 0}, ignore=["steps"])
     assert (mdp.num_states, mdp.max_episode_steps, mdp.action_names) == (CELLS, limit, ("0", "1"))
     assert mdp.truth == "enumerated, 5 states without steps, as you asked"
     assert mdp.goal.tolist() == [False] * 4 + [True]
@@ -211,11 +211,11 @@ def test_what_is_left_out_must_not_matter(variant: str, limit: int, what: str) -
     with pytest.raises(
         InputError, match=f"its {what} is not .* depends on steps, which env.ignore leaves out"
     ):
-        enumerate_env("Corridor-v0", {"variant": variant, "limit": limit}, ignore=["steps"])
+        compile_id("Corridor-v0", {"variant": variant, "limit": limit}, ignore=["steps"])
 
 
 def test_a_reward_for_a_truncation_belongs_to_the_last_step() -> None:
-    mdp = enumerate_env("Corridor-v0", {"variant": "toll", "limit": 9})
+    mdp = compile_id("Corridor-v0", {"variant": "toll", "limit": 9})
     assert Evaluator(mdp, 1.0, 9).optimal_value == 1.5  # it waits, and goes right with the last step
     walk_beside(mdp, gym.make("Corridor-v0", variant="toll", limit=9), 300)
 
@@ -224,14 +224,14 @@ def test_a_reward_for_a_truncation_belongs_to_the_last_step() -> None:
 def test_states_that_hold_the_time_end_at_the_step_limit(variant: str) -> None:
     limit = 7 if variant == "endless" else 12  # whose states are all sequences of actions
     kwargs = {"variant": variant, "max_episode_steps": limit}
-    mdp = enumerate_env("ShortCorridor-v0", kwargs, most_states=500)
+    mdp = compile_id("ShortCorridor-v0", kwargs, most_states=500)
     assert mdp.max_episode_steps == limit
     assert Evaluator(mdp, 1.0, limit).optimal_value == 1
     walk_beside(mdp, gym.make("ShortCorridor-v0", **kwargs), 500)
 
 
 def test_states_beyond_the_step_limit_that_have_an_end_are_found() -> None:
-    mdp = enumerate_env("ShortCorridor-v0", {"max_episode_steps": 2}, ignore=["steps"])
+    mdp = compile_id("ShortCorridor-v0", {"max_episode_steps": 2}, ignore=["steps"])
     assert (mdp.num_states, mdp.max_episode_steps) == (CELLS, 2)
     assert Evaluator(mdp, 1.0, 2).optimum.expected_return == 0
 
@@ -254,7 +254,7 @@ def test_states_beyond_the_step_limit_that_have_an_end_are_found() -> None:
 )
 def test_what_cannot_be_enumerated_is_refused(env_id: str, kwargs: dict[str, Any], reason: str) -> None:
     with pytest.raises(InputError, match=f"^env.*{env_id}.*{reason}") as refused:
-        enumerate_env(env_id, kwargs, most_states=300)
+        compile_id(env_id, kwargs, most_states=300)
     assert "\n" not in str(refused.value)
 
 
@@ -295,9 +295,9 @@ def test_what_is_held_is_state_or_refused(what: str) -> None:
     try:
         if told:
             with pytest.raises(InputError, match=f"^env.id=Holding-v0: .*{told}"):
-                enumerate_env("Holding-v0")
+                compile_id("Holding-v0")
         else:
-            assert Evaluator(enumerate_env("Holding-v0"), 1.0, 9).optimal_value == 1
+            assert Evaluator(compile_id("Holding-v0"), 1.0, 9).optimal_value == 1
     finally:
         del gym.registry["Holding-v0"]
 
@@ -307,7 +307,7 @@ def test_an_observation_must_fit_its_space(variant: str) -> None:
     with pytest.raises(
         InputError, match=r"^env.id=Corridor-v0: an observation is .*not in its space"
     ) as refused:
-        enumerate_env("Corridor-v0", {"variant": variant})
+        compile_id("Corridor-v0", {"variant": variant})
     assert "\n" not in str(refused.value)
 
 
@@ -315,7 +315,7 @@ def test_an_attribute_that_is_left_out_must_be_there() -> None:
     with pytest.raises(
         InputError, match=r"env.ignore=\['step'\]: Corridor-v0 has no attribute step; it has .*steps"
     ):
-        enumerate_env("Corridor-v0", ignore=["step"])
+        compile_id("Corridor-v0", ignore=["step"])
 
 
 class Counted(Corridor):
@@ -328,8 +328,8 @@ class Counted(Corridor):
 
 def test_what_changes_with_every_episode_is_named() -> None:
     with pytest.raises(InputError, match=r"the same state \(in episodes\).*ignore"):
-        enumerate_env("Counted-v0", {"limit": 9})
-    assert enumerate_env("Counted-v0", {"limit": 9}, ignore=["episodes", "steps"]).num_states == CELLS
+        compile_id("Counted-v0", {"limit": 9})
+    assert compile_id("Counted-v0", {"limit": 9}, ignore=["episodes", "steps"]).num_states == CELLS
 
 
 class Lock(gym.Env[Any, int]):
@@ -356,7 +356,7 @@ class Lock(gym.Env[Any, int]):
 def test_a_reset_is_tried_from_every_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(gym.registry, "Lock-v0", gym.envs.registration.EnvSpec("Lock-v0", entry_point=Lock))
     with pytest.raises(InputError, match=r"a reset does not always lead to the same state \(in found\)"):
-        enumerate_env("Lock-v0")
+        compile_id("Lock-v0")
 
 
 class Ferry(gym.Env[Any, int]):
@@ -393,20 +393,20 @@ class Ferry(gym.Env[Any, int]):
 )
 def test_what_is_there_for_a_time_only(cells: int, first: int, last: int) -> None:
     kwargs = {"cells": cells, "first": first, "last": last}
-    mdp = enumerate_env("Ferry-v0", kwargs)
+    mdp = compile_id("Ferry-v0", kwargs)
     boarded = max(cells, first)
     truth = 0.98**boarded if boarded <= min(last, 19) else 0
     assert Evaluator(mdp, 0.98, 20).optimal_value == pytest.approx(max(truth, 0.2), abs=1e-12)
     if truth and last > first:  # one moment is hardly met by chance, so it rests on the user's word
         with pytest.raises(InputError, match=r"env.ignore leaves out"):
-            enumerate_env("Ferry-v0", kwargs, ignore=["clock"])
+            compile_id("Ferry-v0", kwargs, ignore=["clock"])
 
 
 def test_a_wrapper_of_an_id_belongs_to_the_world() -> None:
-    assert Evaluator(enumerate_env("DoubledCorridor-v0", {"limit": 20}), 1.0, 20).optimal_value == 2
+    assert Evaluator(compile_id("DoubledCorridor-v0", {"limit": 20}), 1.0, 20).optimal_value == 2
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "minigrid", None)
     with pytest.raises(InputError, match=r"needs the package minigrid; install it with pip install"):
-        enumerate_env(MINIGRID)
+        compile_id(MINIGRID)

@@ -184,7 +184,7 @@ ROW = [(1.0, 0, 0.0, False)]
 @pytest.mark.parametrize(
     ("changed", "told"),
     [
-        ({"P": None}, "has no transition table P; .*env=enumerated can find"),
+        ({"P": None}, "has no transition table P with a start"),
         ({"P": {0: {0: ROW, 1: ROW}}}, "P must have for each of 2 states and 2 actions a list"),
         ({"P": [[ROW, ROW], [ROW]]}, "P must have"),
         ({"P": [[ROW, ROW], [ROW, []]]}, "P must have"),
@@ -194,7 +194,8 @@ ROW = [(1.0, 0, 0.0, False)]
         ({"P": [[ROW, ROW], [ROW, [(1.0, 0, 0.0, None)]]]}, "P must have"),
         ({"P": [[ROW, ROW], [ROW, [(0.5, 0, 0.0, False)]]]}, "probability of state 1, action 1"),
         ({"P": [[ROW, ROW], [ROW, [(1.0, 0, float("nan"), False)]]]}, "reward of state 1, action 1"),
-        ({"initial_state_distrib": None}, "initial_state_distrib must be the 2 probabilities"),
+        ({"initial_state_distrib": [1.0]}, "initial_state_distrib must be the 2 probabilities"),
+        ({"initial_state_distrib": None}, "has no transition table P with a start"),
         ({"observation_space": spaces.Box(0, 1)}, "its observation space is Box"),
         ({"action_space": spaces.Discrete(2, start=1)}, "its action space is Discrete"),
         ({"observation_space": spaces.Discrete(10**6)}, "1,000,000 states and 2 actions are too many"),
@@ -220,7 +221,7 @@ def test_a_table_that_is_none_is_refused(changed, told):
         (3, {}, "env.id=3: "),
         ("no_module.here:Any-v0", {}, "env.id=no_module.here:Any-v0: no module no_module; install"),
         (":Any-v0", {}, "env.id=:Any-v0: is not registered with Gymnasium"),
-        ("gymnasium:Lake-v1", {}, "env.id=gymnasium:Lake-v1: is not registered with Gymnasium"),
+        ("gymnasium:Lake-v1", {}, "the module gymnasium has no Lake-v1, nor is it registered with"),
         ("CartPole-v1", {}, r"its states are continuous, .*cartpole.py"),
         ("FrozenLake-v1", {"is_slipery": True}, "env.kwargs={is_slipery: True}: .*argument 'is_slipery'"),
         ("FrozenLake-v1", {"map_name": "9x9"}, "env.kwargs={map_name: 9x9}: FrozenLake-v1 cannot be made"),
