@@ -31,7 +31,8 @@ from gridworld.base.bounds import positive_int
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import check_memory
 from gridworld.envs import rendering as drawing
-from gridworld.world.mdp import IntArray, Mdp
+from gridworld.world.mdp import IntArray, Mdp, leaves_of, taken
+from gridworld.world.shown import channels_first
 
 IMAGE_CELL_SIZE = 8  # pixels; 5x6 cells and their border make 56 x 64, enough for SB3's NatureCNN
 
@@ -54,7 +55,7 @@ class ObservationTable:
     def rows(self, states: IntArray, out: NDArray[Any] | None = None) -> NDArray[Any]:
         """Look up the observations (..., *shape) of states (...), in `out` or a fresh array."""
         if isinstance(self.stored, dict):
-            return {key: table[states] for key, table in self.stored.items()}  # type: ignore[return-value]
+            return taken(self.stored, states)  # type: ignore[no-any-return]
         if self.stored is not None:
             # States are within the table; "clip" merely spares numpy a buffered copy.
             return np.take(self.stored, states, axis=0, out=out, mode="clip" if out is not None else "raise")
@@ -70,7 +71,7 @@ class ObservationTable:
         return self.rows(np.arange(self.num_states))
 
 
-Rows = tuple[gym.Space[Any], NDArray[Any] | None]  # of one observation; (S, *shape) or None, see the table
+Rows = tuple[gym.Space[Any], Any]  # of one observation; (S, *shape) or None, see the table
 
 
 def _one_hot(mdp: Mdp, cell_size: int) -> Rows:
@@ -117,17 +118,19 @@ def _image(mdp: Mdp, cell_size: int) -> Rows:
 
 
 def _own(mdp: Mdp, cell_size: int) -> Rows:
-    """As it is, within the table's bounds; pixels are flat, for SB3 would take others for CnnPolicy's."""
-    table = mdp.own_observation
+    """As the environment shows it; of arrays alone, within their own bounds."""
+    table, space = mdp.own_observation, mdp.own_space
     if table is None:
         raise InputError(
             f"observation own: {mdp.name} has no array observation of its own; use another observation"
         )
+    if space is not None:
+        return channels_first(space, table)
     if table.ndim == 1 and table.dtype.kind in "iu":
         return spaces.Discrete(int(table.max()) + 1), table.astype(np.int64)
     low, high = table.min(), table.max()
     if table.ndim == 4 and table.dtype == np.uint8 and (low, high) == (0, 255):
-        table = table.reshape(len(table), -1)
+        table = table.reshape(len(table), -1)  # SB3 would take other pixels for CnnPolicy's
     return spaces.Box(low, high, table.shape[1:], table.dtype.type), table
 
 
@@ -146,8 +149,8 @@ def make_observation(mdp: Mdp, kind: str, cell_size: int = IMAGE_CELL_SIZE) -> O
         *others, last = KINDS
         raise InputError(f"observation kind {kind!r}: must be {', '.join(others)} or {last}")
     space, stored = KINDS[kind](mdp, cell_size)
-    if stored is not None:
-        stored.setflags(write=False)
+    for each in leaves_of(stored) if stored is not None else ():
+        each.setflags(write=False)
     return ObservationTable(kind, space, mdp.num_states, stored)
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
@@ -55,7 +56,8 @@ class Mdp:
     # what messages call the state of each number, if not by place or number
     state_names: tuple[str, ...] = ()
     max_episode_steps: int | None = None  # the step limit that belongs to the world, if any
-    own_observation: NDArray[Any] | None = field(default=None, repr=False)  # (S, ...), the environment's own
+    own_observation: Any = field(default=None, repr=False)  # what the environment shows, see `world.shown`
+    own_space: Any = None  # of one of these; None: as the arrays are
     truth: str = EXACT  # where the tables come from, as tables and pictures say it
 
     def __repr__(self) -> str:
@@ -208,6 +210,24 @@ def grid_places(num_rows: int, num_cols: int) -> NDArray[np.int64]:
     """`Mdp.places` of a grid in one panel, row by row from the top left: (num_rows * num_cols, 3)."""
     row, col = np.divmod(np.arange(num_rows * num_cols), num_cols)
     return np.stack([np.zeros_like(row), row, col], axis=1)
+
+
+def leaves_of(rows: Any) -> Iterator[NDArray[Any]]:
+    """The arrays of what is shown in all states, in the order of their space."""
+    if isinstance(rows, dict | tuple):
+        for each in rows.values() if isinstance(rows, dict) else rows:
+            yield from leaves_of(each)
+    else:
+        yield rows
+
+
+def taken(rows: Any, states: Any) -> Any:
+    """What is shown in some states."""
+    if isinstance(rows, dict):
+        return {key: taken(each, states) for key, each in rows.items()}
+    if isinstance(rows, tuple):
+        return tuple(taken(each, states) for each in rows)
+    return None if rows is None else rows[states]
 
 
 def frozen(table: Table) -> Table:

@@ -27,8 +27,11 @@ from gridworld.world.mdp import (
     Mdp,
     checked_reward,
     frozen,
+    leaves_of,
     steps_from,
+    taken,
 )
+from gridworld.world.shown import misfit
 
 MOST_ACTIONS = 256
 MOST_STATES = 512 * 512
@@ -68,15 +71,18 @@ def mdp_from_outcomes(
     places: IntArray | None = None,
     panel_names: Sequence[str] = (),
     max_episode_steps: int | None = None,
-    own_observation: NDArray[Any] | None = None,
+    own_observation: Any = None,
+    own_space: Any = None,
 ) -> Mdp:
     """Compile what a source says into a world, whose states 0 to N - 1 are the numbered ones.
 
-    `action_names` None: their numbers; `places` (N, 3) and `own_observation` (N, *shape): see `Mdp`. Refuses
+    `action_names` None: their numbers; `places` (N, 3), `own_observation` (N, *shape): see `Mdp`. Refuses
     shapes that do not fit, no probabilities, numbers of no state, or too many of them.
     """
     outcomes = checked(name, outcomes)
-    _check_extras(name, outcomes, action_names, places, max_episode_steps, own_observation)
+    _check_extras(name, outcomes, action_names, places, max_episode_steps)
+    if own_observation is not None and (wrong := misfit(own_space, own_observation, len(outcomes.start))):
+        raise InputError(f"{name}: own_observation {wrong}")
     ends, success, number, leads_to = _ends(outcomes)
     size, actions, count = len(number), *outcomes.next_state.shape[1:]
     numbered, further = slice(0, len(outcomes.start)), len(number) - len(outcomes.start)
@@ -108,8 +114,15 @@ def mdp_from_outcomes(
         places=None if places is None else frozen(places[number].astype(np.int64)),
         panel_names=tuple(panel_names),
         max_episode_steps=None if max_episode_steps is None else int(max_episode_steps),
-        own_observation=None if own_observation is None else frozen(own_observation[number]),
+        own_observation=_frozen(taken(own_observation, number)),
+        own_space=own_space,
     )
+
+
+def _frozen(rows: Any) -> Any:
+    for each in leaves_of(rows) if rows is not None else ():
+        frozen(each)
+    return rows
 
 
 def _ends(outcomes: Outcomes) -> tuple[IntArray, BoolArray, IntArray, IntArray]:
@@ -257,7 +270,7 @@ def _described(table: Any) -> str:
 
 
 def _check_extras(
-    name: str, outcomes: Outcomes, names: Sequence[str] | None, places: Any, limit: Any, shown: Any
+    name: str, outcomes: Outcomes, names: Sequence[str] | None, places: Any, limit: Any
 ) -> None:
     size, actions = outcomes.next_state.shape[:2]
     if names is not None and len(names) != actions:
@@ -267,8 +280,6 @@ def _check_extras(
             f"{name}: places is {places.dtype} {places.shape}, must be whole numbers ({size}, 3): panel, "
             "row and column per state"
         )
-    if shown is not None and shown.shape[:1] != (size,):
-        raise InputError(f"{name}: own_observation has shape {shown.shape}, must begin with {size} states")
     if limit is not None:
         positive_int(f"{name}: max_episode_steps", limit)
 
@@ -319,9 +330,8 @@ def _check_shapes(mdp: Mdp, where: str) -> None:
         table = getattr(mdp, name)
         if not isinstance(table, np.ndarray) or (table.dtype, table.shape) != (dtype, wanted):
             raise InputError(f"{where}: {name} is {_described(table)}, must be {np.dtype(dtype)} {wanted}")
-    shown = np.zeros(size) if mdp.own_observation is None else mdp.own_observation
-    if not isinstance(shown, np.ndarray) or shown.dtype.kind not in "biuf" or shown.shape[:1] != (size,):
-        raise InputError(f"{where}: own_observation must be numbers, the first of its axes {size} states")
+    if mdp.own_observation is not None and (wrong := misfit(mdp.own_space, mdp.own_observation, size)):
+        raise InputError(f"{where}: own_observation {wrong}")
 
 
 def _check_states(mdp: Mdp, where: str) -> None:

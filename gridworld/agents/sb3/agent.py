@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Dict
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger
@@ -57,7 +58,8 @@ def build(config: SB3Config, context: TrainingContext) -> SB3Agent:
 
     A line says why not where the engine is asked for.
     """
-    algorithm, arguments = algorithm_and_arguments(config, context.features)
+    sees_dict = isinstance(context.observation.space, Dict)
+    algorithm, arguments = algorithm_and_arguments(config, context.features, sees_dict)
     ours = algorithm_of(algorithm) if config.engine == "tabulated" else None
     if ours is not None:
         unknown = "callbacks" if context.callbacks else unknown_to_engine(config, algorithm, arguments)

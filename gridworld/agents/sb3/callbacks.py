@@ -291,7 +291,13 @@ def _replay(model: Any) -> State:
     if buffer is None or isinstance(buffer, HasState):
         return {}
     count = buffer.buffer_size if buffer.full else buffer.pos
-    arrays = {name: each for name, each in vars(buffer).items() if isinstance(each, np.ndarray)}
+    held = {name: each if isinstance(each, dict) else {"": each} for name, each in vars(buffer).items()}
+    arrays = {
+        f"{name}.{key}" if key else name: each
+        for name, parts in held.items()
+        for key, each in parts.items()
+        if isinstance(each, np.ndarray)
+    }
     rows = {name: each[:count] for name, each in arrays.items() if len(each) == buffer.buffer_size}
     return {**rows, "pos": int(buffer.pos), "full": bool(buffer.full)}
 

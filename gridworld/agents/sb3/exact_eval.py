@@ -39,6 +39,7 @@ from gridworld.world.door.layers import random_states
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray, IntArray
 from gridworld.world.metrics import numbers
+from gridworld.world.shown import channels_first
 
 _LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.", "torch.")
 _ONE_BY_ONE = 512  # states in which `predict` is asked alone, too
@@ -99,8 +100,9 @@ class ForeignPolicy:
     def _observation(self) -> ObservationTable:
         """What it sees of each state: what the task shows, or the world's own observation with its space."""
         seen, wanted = None if self._task.seen is None else self._task.seen(), self._policy.observation_space
-        if seen is not None and seen.space != wanted and _is_transposed(seen.space, wanted):
-            return tabulated(wanted, seen.table().transpose(0, 3, 1, 2), seen.num_states)
+        if seen is not None and seen.space != wanted and seen.stored is not None:
+            space, rows = channels_first(seen.space, seen.stored)
+            seen = seen if space != wanted else tabulated(space, rows, seen.num_states)
         if seen is not None and seen.space == wanted:
             return seen
         if seen is not None and seen.kind not in KINDS:
@@ -180,13 +182,6 @@ def _is_of_a_library(model: Any, policy: BasePolicy) -> bool:
     modules = [each.__module__ for each in (*map(type, policy.modules()), *filter(None, methods))]
     is_replaced = any(name in vars(thing) for thing in (model, policy) for name in _PREDICTS)
     return not is_replaced and all(module.startswith(_LIBRARIES) for module in modules)
-
-
-def _is_transposed(shown: Any, wanted: Any) -> bool:
-    """Whether images are shown with their channels last, which `predict` takes too."""
-    shape: tuple[int, ...] = shown.shape or ()
-    is_image = len(shape) == 3 and shown.dtype == wanted.dtype == np.uint8
-    return is_image and (shape[2], *shape[:2]) == wanted.shape
 
 
 class ExactEvalCallback(BaseCallback):

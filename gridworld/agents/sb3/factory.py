@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -12,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 import stable_baselines3
 import torch
+from gymnasium.spaces import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -27,6 +27,7 @@ from gridworld.base.errors import InputError, in_short
 from gridworld.base.user_input import check_memory, imported, is_limited
 from gridworld.base.workarounds import generator_of, keep_compiler_out
 from gridworld.config.fields import falls, parse_schedule
+from gridworld.world.mdp import leaves_of
 
 Arguments = dict[str, Any]
 
@@ -58,11 +59,12 @@ def failed(config: SB3Config, what: str, error: Exception) -> InputError:
 
 
 def algorithm_and_arguments(
-    config: SB3Config, features: Mapping[str, Any] = MappingProxyType({})
+    config: SB3Config, features: Mapping[str, Any] = MappingProxyType({}), sees_dict: bool = False
 ) -> tuple[type[BaseAlgorithm], Arguments]:
     """A class of SB3's kind, and its keyword arguments but for environments, seed and device.
 
-    `features` is what the observation adds to the settings of an `MlpPolicy`.
+    `features` is what the observation adds to the settings of an `MlpPolicy`, which is a `MultiInputPolicy`
+    where observations are a Dict.
     """
     is_any = isinstance(config, SB3ClassConfig)
     path = config.algorithm if is_any else f"{stable_baselines3.__name__}.{config.algorithm}"
@@ -80,7 +82,7 @@ def algorithm_and_arguments(
     arguments.pop("policy_kwargs", None)
     return algorithm, {
         **arguments,
-        "policy": _policy(config, algorithm),
+        "policy": _policy(config, algorithm, sees_dict),
         **({"policy_kwargs": kwargs} if kwargs else {}),
     }
 
@@ -100,13 +102,14 @@ def import_class(where: str, path: Any, kind: type) -> Any:
     return found
 
 
-def _policy(config: SB3Config, algorithm: type[BaseAlgorithm]) -> type[BasePolicy]:
-    if config.policy in algorithm.policy_aliases:
-        return algorithm.policy_aliases[config.policy]
+def _policy(config: SB3Config, algorithm: type[BaseAlgorithm], sees_dict: bool) -> type[BasePolicy]:
+    name = "MultiInputPolicy" if sees_dict and config.policy == "MlpPolicy" else config.policy
+    if name in algorithm.policy_aliases:
+        return algorithm.policy_aliases[name]
     if "." in config.policy:
         policy: type[BasePolicy] = import_class("agent.policy", config.policy, BasePolicy)
         return policy
-    known = ", ".join(name for name in algorithm.policy_aliases if name != "MultiInputPolicy")
+    known = ", ".join(algorithm.policy_aliases)
     raise InputError(f"agent.policy={config.policy}: {config.algorithm} has {known}")
 
 
@@ -185,9 +188,9 @@ def make_model(
 def _check_network(config: SB3Config, context: TrainingContext) -> None:
     """Refuse a network that would take more than the memory budget, alone or in a pass over the states."""
     observation, space = context.observation, cast(Any, context.observation.space)
-    size = math.prod(space.shape) if space.shape else int(space.n)
+    size = flatdim(space)
     per_number = _PIXEL_PASS if space.dtype == np.uint8 else _NUMBER_PASS
-    table = 0 if observation.stored is None else observation.stored.nbytes
+    table = 0 if observation.stored is None else sum(each.nbytes for each in leaves_of(observation.stored))
     needed = config.memory(size, context.envs.num_envs, 0) + table
     needed += min(observation.num_states, CHUNK) * per_number * size
     check_memory(f"agent={config.name}: its network", needed)

@@ -19,7 +19,7 @@ from gridworld.config.compose import named_world
 from gridworld.envs.observations import IMAGE_CELL_SIZE, ObservationTable, make_observation
 from gridworld.envs.vector_env import GridWorldVectorEnv, StateArray
 from gridworld.world.layout import CLASSIC, Layout
-from gridworld.world.mdp import Mdp
+from gridworld.world.mdp import Mdp, taken
 
 _OF_A_BATCH = {"max_episode_steps", "stratified", "render_mode"}  # arguments that no world has
 _MASKS = "action_masks"  # asked for by agents that respect them; here nothing is ever forbidden
@@ -69,7 +69,8 @@ class GridWorldVecEnv(VecEnv):
         step = self.envs.advance(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         last, elapsed = self.observation.rows(step.reached[step.which]), round(time.time() - self._started, 6)
-        of_each = zip(step.which.tolist(), last, step.returns.tolist(), step.lengths.tolist(), strict=True)
+        shown = [taken(last, at) for at in range(len(step.which))]
+        of_each = zip(step.which.tolist(), shown, step.returns.tolist(), step.lengths.tolist(), strict=True)
         for index, observation, episode_return, length in of_each:
             infos[index] = {
                 "terminal_observation": observation,

@@ -59,32 +59,3 @@ def _misfit(observation: Any, space: gym.Space[Any], refusal: Callable[[str], In
     return refusal(
         f"an observation is {on_a_line(observation)}, which is not in its space {on_a_line(space)}"
     )
-
-
-def stacked(space: gym.Space[Any], parts: Any) -> Any:
-    """Observations as arrays of all states, from an iterator over the leaves of a space; None for others."""
-    if isinstance(space, spaces.Dict):
-        return {key: stacked(each, parts) for key, each in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        return tuple(stacked(each, parts) for each in space.spaces)
-    found = next(parts)
-    return None if isinstance(found[0], bytes) else np.stack(found)
-
-
-def taken(rows: Any, states: NDArray[Any]) -> Any:
-    """The rows of some states, of what `stacked` makes."""
-    if isinstance(rows, dict):
-        return {key: taken(each, states) for key, each in rows.items()}
-    if isinstance(rows, tuple):
-        return tuple(taken(each, states) for each in rows)
-    return None if rows is None else rows[states]
-
-
-def own_array(space: gym.Space[Any], rows: Any) -> NDArray[Any] | None:
-    """What `observation=own` shows: an array, of a Dict its `image`, of a Tuple of numbers these."""
-    if isinstance(space, spaces.Dict):
-        return rows.get("image") if isinstance(rows.get("image"), np.ndarray) else None
-    if isinstance(space, spaces.Tuple):
-        is_numbers = all(isinstance(each, spaces.Discrete) for each in space.spaces)
-        return np.stack(rows, axis=1).astype(np.int64) if is_numbers and len(rows) else None
-    return rows if isinstance(rows, np.ndarray) else None

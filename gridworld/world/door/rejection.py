@@ -112,13 +112,17 @@ class Rejecting(Branching):
     def first(self, step: Callable[[], Result]) -> Result:
         """The result of a step in which every draw has its first outcome that is not rejected."""
         self._decisions, self._taken, self._met, self._across = [], [], {}, False
-        while True:
-            try:
-                return self._ran(step)
-            except (_Again, _Known):
-                del self._decisions[self._place :], self._taken[self._place :]
-                if not self._next():
-                    raise self._endless() from None
+        known, self._known = self._known, {}  # since it is to run to its end
+        try:
+            while True:
+                try:
+                    return self._ran(step)
+                except _Again:
+                    del self._decisions[self._place :], self._taken[self._place :]
+                    if not self._next():
+                        raise self._endless() from None
+        finally:
+            self._known = known
 
     def _endless(self) -> InputError:
         return InputError(f"{self._where}: a loop draws again without end, since nothing ever fits")

@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from gridworld.base.user_input import check_memory
 from gridworld.world.door.beliefs import Beliefs, Node
 from gridworld.world.door.layers import Env
-from gridworld.world.door.observations import own_array, stacked, taken
 from gridworld.world.door.search import MOST_SECONDS, MOST_STATES, Named, Search, State
 from gridworld.world.door.word import NO_LIMIT
-from gridworld.world.mdp import ENUMERATED, Mdp
+from gridworld.world.mdp import ENUMERATED, Mdp, taken
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
+from gridworld.world.shown import of_learners, stacked
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +115,7 @@ class _World:
             places[:, 1:] -= places[:, 1:].min(axis=0)  # without the walls around the room
         limits = [each for each in (_own_limit(search), search.layers.limit) if each is not None]
         rows = stacked(space, iter(zip(*leaves, strict=True)))
+        own = of_learners(space, rows)
         mdp = mdp_from_outcomes(
             name,
             _renumbered(beliefs.outcomes(name, search.num_actions), numbers, size),
@@ -122,7 +123,8 @@ class _World:
             places=places,
             panel_names=panels,
             max_episode_steps=min(limits, default=None),
-            own_observation=own_array(space, rows),
+            own_space=own[0],
+            own_observation=own[1],
         )
         names = tuple(each for each, _ in named)
         mdp = replace(mdp, state_names=names if all(names) else (), truth=self._truth())

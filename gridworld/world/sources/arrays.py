@@ -34,11 +34,12 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from gymnasium.spaces import Dict
 from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError, in_short
 from gridworld.base.user_input import DAMAGED, check_memory, imported, npz_arrays, npz_bytes, open_users_file
-from gridworld.world.mdp import Mdp, frozen
+from gridworld.world.mdp import Mdp, frozen, leaves_of
 from gridworld.world.outcomes import (
     MOST_STATES,
     Outcomes,
@@ -47,12 +48,14 @@ from gridworld.world.outcomes import (
     mdp_from_outcomes,
     verified,
 )
+from gridworld.world.shown import space_of_text, space_text
 from gridworld.world.sources.gymnasium_table import mdp_of_table
 
 _TABLES = ("next_state", "probability", "reward", "terminated", "success")
 _NEEDED = ("next_state", "reward", "terminated", "start")
 _OPTIONAL = ("probability", "success", "action_names", "places", "max_episode_steps", "name")
 _LISTS = ("panel_names", "state_names")  # of names, which most worlds do not have
+_OWN = "own_observation"
 _MOST_BYTES = 4 * 2**30
 _FORMAT = np.array("gridworld world 1")
 
@@ -230,7 +233,11 @@ def world_bytes(mdp: Mdp) -> bytes:
     arrays = {"format": _FORMAT}
     for field in dataclasses.fields(Mdp):
         value = getattr(mdp, field.name)
-        if value is not None and not (field.name in _LISTS and not value):
+        if field.name == _OWN and isinstance(value, dict):
+            arrays |= {f"{_OWN}.{n}": np.ascontiguousarray(each) for n, each in enumerate(leaves_of(value))}
+        elif field.name == "own_space" and value is not None:
+            arrays[field.name] = np.array(space_text(value))
+        elif value is not None and not (field.name in _LISTS and not value):
             arrays[field.name] = np.ascontiguousarray(value) if np.ndim(value) else np.array(value)
     return npz_bytes(arrays)
 
@@ -244,17 +251,31 @@ def _from_fields(found: dict[str, NDArray[Any]], where: str) -> Mdp:
     fields = {field.name: field for field in dataclasses.fields(Mdp)}
     if not np.array_equal(found.pop("format", np.array("")), _FORMAT):
         raise InputError(f"{where}: not a world of this version, must contain format={_FORMAT}")
+    own = _own(found, where)
     needed = {name for name, field in fields.items() if field.default is dataclasses.MISSING}
     if not needed <= found.keys() <= fields.keys():
         raise InputError(
             f"{where}: not a world, must contain {sorted(needed)}, contains {sorted(found)[:20]}"
         )
-    values: dict[str, Any] = dict(found)
+    values: dict[str, Any] = {**found, **own}
     for key in ("name", "truth"):
         if key in found:
             values[key] = checked_text(where, key, found[key])
     for key in ("action_names", *_LISTS):
         values[key] = tuple(_names(where, key, found.get(key)) or ())
     values["max_episode_steps"] = _whole(where, "max_episode_steps", found.get("max_episode_steps"))
+    for each in leaves_of(own.get(_OWN, {})):
+        frozen(each)
     tables = {key: frozen(value) for key, value in values.items() if isinstance(value, np.ndarray)}
     return verified(Mdp(**{**values, **tables}), where)
+
+
+def _own(found: dict[str, NDArray[Any]], where: str) -> dict[str, Any]:
+    """The space of what the environment shows, and of a Dict its rows, arrays 0, 1, ... in a file."""
+    if "own_space" not in found:
+        return {}
+    space = space_of_text(str(found.pop("own_space")), where)
+    if not isinstance(space, Dict):
+        return {"own_space": space}
+    parts = {key: found.pop(f"{_OWN}.{n}", None) for n, key in enumerate(space.spaces)}
+    return {"own_space": space, _OWN: {key: each for key, each in parts.items() if each is not None}}

@@ -1,0 +1,139 @@
+"""What an environment shows in each state, for `observation=own`: its space, and rows as a learner gets them.
+
+Rows are an array (S, *shape), or such arrays by the keys of a Dict.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from gridworld.base.errors import InputError
+from gridworld.base.user_input import check_memory
+
+_ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+
+
+def of_learners(space: gym.Space[Any], rows: Any) -> tuple[gym.Space[Any] | None, Any]:
+    """The space and the rows that SB3 learns from.
+
+    They are the environment's own where SB3 takes its space. Of a Tuple of numbers, and of a Discrete that
+    does not start at 0, there are only the numbers, without a space; of a Dict with texts the array called
+    `image`. Where there is nothing, both are None.
+    """
+    flat = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+    if all(isinstance(each, _ARRAYS) and not np.any(getattr(each, "start", 0)) for each in flat):
+        return space, rows
+    if isinstance(space, spaces.Dict):
+        return None, rows["image"] if isinstance(rows.get("image"), np.ndarray) else None
+    if isinstance(space, spaces.Tuple):
+        is_numbers = all(isinstance(each, spaces.Discrete) for each in space.spaces)
+        return None, np.stack(rows, axis=1).astype(np.int64) if is_numbers and len(rows) else None
+    return None, rows if isinstance(rows, np.ndarray) else None
+
+
+def channels_first(space: gym.Space[Any], rows: Any) -> tuple[gym.Space[Any], Any]:
+    """The same with images as (C, H, W), which SB3 makes of (H, W, C) before it learns."""
+    if isinstance(space, spaces.Dict):
+        parts = {key: channels_first(each, rows[key]) for key, each in space.spaces.items()}
+        if all(parts[key][0] is each for key, each in space.spaces.items()):
+            return space, rows
+        return spaces.Dict([(key, each) for key, (each, _) in parts.items()]), {
+            key: each for key, (_, each) in parts.items()
+        }
+    if not isinstance(space, spaces.Box) or len(space.shape) != 3 or space.dtype != np.uint8:
+        return space, rows
+    if (space.low != 0).any() or (space.high != 255).any() or not np.argmin(space.shape):
+        return space, rows
+    turned = np.ascontiguousarray(np.moveaxis(rows, -1, 1))
+    return spaces.Box(0, 255, turned.shape[1:], np.uint8), turned
+
+
+def stacked(space: gym.Space[Any], parts: Iterator[Any]) -> Any:
+    """Observations as arrays of all states, from an iterator over the leaves of a space; None for others."""
+    if isinstance(space, spaces.Dict):
+        return {key: stacked(each, parts) for key, each in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(stacked(each, parts) for each in space.spaces)
+    found = next(parts)
+    return None if isinstance(found[0], bytes) else np.stack(found)
+
+
+def misfit(space: gym.Space[Any] | None, rows: Any, size: int) -> str | None:
+    """Why rows are not those of so many states, of the space if there is one; None: they are."""
+    if isinstance(space, spaces.Dict):
+        if not isinstance(rows, dict) or rows.keys() != space.spaces.keys():
+            return f"must have {', '.join(space.spaces)}"
+        found = (misfit(each, rows[key], size) for key, each in space.spaces.items())
+        return next((each for each in found if each is not None), None)
+    if not isinstance(rows, np.ndarray) or rows.dtype.kind not in "biuf" or rows.shape[:1] != (size,):
+        return f"must be numbers, the first of its axes {size} states"
+    if space is None:
+        return None
+    fits = rows.dtype == space.dtype and rows.shape[1:] == space.shape
+    if fits and isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+        most = space.n if isinstance(space, spaces.Discrete) else space.nvec
+        fits = bool(((rows >= 0) & (rows < most)).all())
+    return None if fits else f"does not fit its space {' '.join(str(space).split())[:100]}"
+
+
+def space_text(space: gym.Space[Any]) -> str:
+    """A space of learners as JSON."""
+    if isinstance(space, spaces.Dict):
+        return json.dumps({"Dict": [[key, space_text(each)] for key, each in space.spaces.items()]})
+    if isinstance(space, spaces.Box):
+        bounds = (
+            [
+                each.flat[0].item() if (each == each.flat[0]).all() else each.tolist()
+                for each in (space.low, space.high)
+            ]
+            if space.low.size
+            else [0, 0]
+        )
+        return json.dumps({"Box": [*bounds, list(space.shape), space.dtype.str]})
+    if isinstance(space, spaces.Discrete):
+        return json.dumps({"Discrete": [int(space.n), space.dtype.str]})
+    if isinstance(space, spaces.MultiDiscrete):
+        return json.dumps({"MultiDiscrete": [space.nvec.tolist(), space.dtype.str]})
+    assert isinstance(space, spaces.MultiBinary)
+    return json.dumps({"MultiBinary": list(space.shape)})
+
+
+def space_of_text(text: str, where: str) -> gym.Space[Any]:
+    """Mirrors `space_text`; InputError: it is none."""
+    try:
+        ((kind, given),) = json.loads(text).items()
+        if kind == "Dict":
+            return spaces.Dict([(str(key), space_of_text(each, where)) for key, each in given])
+        if kind == "Box":
+            low, high, shape, name = given
+            of: Any = np.dtype(name).type
+            check_memory(where, 3 * 8 * math.prod(shape))
+            low, high = (np.broadcast_to(np.array(each, of), shape) for each in (low, high))
+            return cast(gym.Space[Any], spaces.Box(low, high, tuple(shape), of))
+        if kind == "Discrete":
+            return spaces.Discrete(given[0], dtype=np.dtype(given[1]).type)
+        if kind == "MultiDiscrete":
+            return spaces.MultiDiscrete(np.array(given[0]), dtype=np.dtype(given[1]).type)
+        if kind == "MultiBinary":
+            return spaces.MultiBinary(given if len(given) > 1 else given[0])
+    except InputError:
+        raise
+    except (
+        ValueError,
+        TypeError,
+        LookupError,
+        AssertionError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+        MemoryError,
+    ):
+        pass
+    raise InputError(f"{where}: own_space is no observation space")
