@@ -136,8 +136,9 @@ class RunResult:
         sources = (f"data:image/png;base64,{base64.b64encode(each).decode()}" for each in pictures)
         images = "".join(f'<img src="{each}" style="max-width:100%;max-height:340px"> ' for each in sources)
         why = "" if self.summary["certified"] else "; gridworld.diagnose(run) says why"
-        sentence = escape(run_summary.verdict(self.summary))
-        return f"<p>{escape(repr(self))}<br><b>{sentence}</b>{why}</p>{images}"
+        sentence, scope = run_summary.verdict(self.summary), run_summary.scope_of(self.summary)
+        known = "" if scope == BY_CONSTRUCTION else f"<br>world: {escape(scope)}"
+        return f"<p>{escape(repr(self))}<br><b>{escape(sentence)}</b>{why}{known}</p>{images}"
 
     def __repr__(self) -> str:
         summary = self.summary

@@ -29,6 +29,7 @@ from gridworld.envs.observations import make_observation
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.world.mdp import Mdp
 from gridworld.world.metrics import wilson_interval
+from gridworld.world.sources.elsewhere import same_elsewhere
 from gridworld.world.sources.environment import as_environment, make_env, step_limit
 
 _STEPS = 20_000
@@ -118,6 +119,13 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
         limit = step_limit(first) or (None if mdp is None else mdp.max_episode_steps)
         seen = Seen(first, gamma, found, replayed, _interface(make), limit, mdp)
         findings = [finding for symptom in ALL for finding in symptom(seen)]
+        if mdp is not None and isinstance(env, str) and is_id(env):
+            bounds = {"most_states": _MOST_STATES, "most_seconds": _SECONDS}
+            try:
+                seen.mdp = same_elsewhere(mdp, env, {}, time.monotonic() - began, **bounds)
+            except InputError as error:
+                advice = "draw from np_random only, and sort what is in a set before its order matters."
+                findings.insert(0, EnvFinding("process", ERROR, f"{str(error).partition(': ')[2]}.", advice))
         facts = tuple(_facts(seen))
     return ExamineResult(name, facts, tuple(findings), time.monotonic() - began)
 
@@ -207,7 +215,7 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
     yield "steps", f"{kind}; a seed {'repeats' if seen.replays.repeats else 'does not repeat'} an episode"
     states = "not enumerated; what follows is of a sample"
     if mdp is not None:
-        states = f"{mdp.reachable.sum():,} can be reached ({mdp.truth.partition(',')[0]})"
+        states = f"{mdp.reachable.sum():,} can be reached; known {mdp.scope}"
     yield "states", states
     starts = len(np.unique(steps.before[steps.first]))
     space = " ".join(str(seen.env.observation_space).split())[:60]

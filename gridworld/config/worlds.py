@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import re
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -106,8 +107,9 @@ class GymnasiumConfig(EnvConfig):
     kwargs: Kwargs = field(default_factory=dict)  # of gymnasium.make, the class or the function
     # attributes that are not part of its state, by your word
     ignore: list[Word] = field(default_factory=list)
-    # a search that finds more, or takes longer, is refused
+    # a search that finds more states is refused
     most_states: int = setting(200_000, affects(Effect.NOTHING), bounds(1, 512 * 512))
+    # a search that takes longer is refused
     most_seconds: float = setting(120, affects(Effect.NOTHING), bounds(0, 86_400, above=True))
 
     @property
@@ -125,13 +127,19 @@ class GymnasiumConfig(EnvConfig):
         return has_table(make_env(self.id, self.kwargs).unwrapped)
 
     def compile(self) -> Mdp:
+        from gridworld.world.sources.elsewhere import same_elsewhere
         from gridworld.world.sources.environment import compile_id
 
-        return compile_id(self.id, self.kwargs, **self._bounds(), by_table=not self.ignore)
-
-    def _bounds(self) -> dict[str, Any]:
-        """What bounds a search, and what it leaves out."""
-        return {"ignore": self.ignore, "most_states": self.most_states, "most_seconds": self.most_seconds}
+        began = time.monotonic()
+        bounds = {
+            "ignore": list(self.ignore),
+            "most_states": self.most_states,
+            "most_seconds": self.most_seconds,
+        }
+        by_table = not (isinstance(self, EnumeratedConfig) or self.ignore)
+        mdp = compile_id(self.id, self.kwargs, by_table=by_table, **bounds)
+        took = time.monotonic() - began
+        return same_elsewhere(mdp, self.id, self.kwargs, took, by_table=by_table, **bounds)
 
     def step_limit(self, mdp: Mdp) -> int:
         limit, own = super().step_limit(mdp), mdp.max_episode_steps
@@ -149,11 +157,6 @@ class EnumeratedConfig(GymnasiumConfig):
     """An environment of Gymnasium whose states are found by trying all actions and random draws."""
 
     source: Word = "enumerated"
-
-    def compile(self) -> Mdp:
-        from gridworld.world.sources.environment import compile_id
-
-        return compile_id(self.id, self.kwargs, **self._bounds(), by_table=False)
 
 
 @dataclass

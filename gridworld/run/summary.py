@@ -13,6 +13,7 @@ from gridworld.base.signals import Interrupted
 from gridworld.base.user_input import users_folder
 from gridworld.run.folder import EVENTS, RunFolder, shell_path
 from gridworld.run.reader import read_run
+from gridworld.world.mdp import BY_CONSTRUCTION
 from gridworld.world.metrics import METRICS
 
 Summary = dict[str, Any]
@@ -76,6 +77,7 @@ def summary_text(summary: Summary, folder: str, advice: Sequence[str] = ()) -> s
         *(f"  {line}" for line in aligned(rows, ("<21", ">9", ">9", ">9", "<0"))),
         "",
         f"  {verdict(summary)}",
+        *([f"  world: {scope}"] if (scope := scope_of(summary)) != BY_CONSTRUCTION else []),
         *([f"  privileges: {', '.join(summary['privileges'])}"] if summary["privileges"] else []),
         *(f"  {line}" for line in advice),
         f"  files: {folder}",
@@ -110,14 +112,18 @@ def _trade(name: str, summary: Summary) -> str:
 
 def verdict(summary: Summary) -> str:
     """Whether the final greedy policy is optimal, in a sentence."""
-    truth = f" (world: {summary['truth']})" if "truth" in summary else ""
     if summary["certified"]:
-        return f"certified optimal since step {summary['certified_since_step']:,}{truth}"
+        return f"certified optimal since step {summary['certified_since_step']:,}"
     count, names = len(summary["endless_cells"]), summary["endless_states"]
     if summary["optimal_length"] >= summary["max_episode_steps"]:  # then the optimum does not end either
         count = 0
     loops = circles_text(count, names, summary["timeout_probability"])
-    return f"not optimal: regret {summary['regret']:.3g}{loops}{truth}"
+    return f"not optimal: regret {summary['regret']:.3g}{loops}"
+
+
+def scope_of(summary: Summary) -> str:
+    """How the tables of the world are known, which earlier runs said in fewer words."""
+    return str(summary.get("scope", summary.get("truth", BY_CONSTRUCTION)))
 
 
 def circles_text(count: int, names: Sequence[str], timeout_probability: float) -> str:

@@ -292,6 +292,7 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
         "agent": config.agent.name,
         "env": mdp.name,
         **({} if mdp.truth == EXACT else {"truth": mdp.truth}),
+        "scope": mdp.scope,
         "observation": config.observation.kind,
         "seed": config.seed,
         "recipe": config.recipe,

@@ -15,7 +15,7 @@ from gridworld.base.bounds import positive_int
 from gridworld.base.console import telling_if_slow
 from gridworld.base.errors import InputError
 from gridworld.world.chain import Chain, Outcome, one_hot_policy
-from gridworld.world.mdp import FloatArray, IntArray, Mdp
+from gridworld.world.mdp import BY_CONSTRUCTION, FloatArray, IntArray, Mdp
 from gridworld.world.solver import Solution, solved
 
 _USUAL_DISCOUNTS = (0.8, 0.9, 0.95, 0.97, 0.99)
@@ -47,6 +47,7 @@ class Score:
     regret: float  # optimal value - value, at least 0 up to rounding
     certified: bool  # no policy is better
     outcome: Outcome  # of an episode within the step limit
+    scope: str = BY_CONSTRUCTION  # how the world's tables are known
 
     @property
     def shortfall(self) -> float:
@@ -57,7 +58,8 @@ class Score:
         """The numbers with four digits; a regret that is 0 but for rounding is 0."""
         numbers = {"value": self.value, "regret": self.shortfall, **vars(self.outcome)}
         shown = (f"{name}={number + 0.0:.4g}" for name, number in numbers.items())  # -0 as 0
-        return f"Score(certified={self.certified}, {', '.join(shown)})"
+        scope = "" if self.scope == BY_CONSTRUCTION else f", scope={self.scope!r}"
+        return f"Score(certified={self.certified}, {', '.join(shown)}{scope})"
 
 
 class Evaluator:
@@ -108,7 +110,8 @@ class Evaluator:
         values = chain.evaluation(gamma).value if self._earns_nothing else chain.value(gamma)
         value = self._at_start(values)
         regret = 0.0 if value == self.optimal_value else self.optimal_value - value  # both may be -inf
-        return Score(value, regret, regret <= self.tolerance, chain.outcome(self.max_episode_steps))
+        outcome = chain.outcome(self.max_episode_steps)
+        return Score(value, regret, regret <= self.tolerance, outcome, self.mdp.scope)
 
     def discounted_return(self, policy: FloatArray) -> float:
         """The exact expected discounted return of an episode within the step limit, of a policy (S, A)."""

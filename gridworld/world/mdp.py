@@ -33,6 +33,8 @@ Table = TypeVar("Table", bound=NDArray[Any])
 # than what counts as 0.
 LEAST_REWARD, MOST_REWARD = 1e-100, 1e100
 EXACT = "exact"  # the `truth` of tables that are given
+BY_CONSTRUCTION = "by construction"  # the `scope` of such worlds
+ELSEWHERE = "the same in"  # how it says that other processes have found the same
 ENUMERATED = "enumerated"  # how the `truth` begins of those that trying all actions found
 
 
@@ -78,6 +80,16 @@ class Mdp:
     def is_enumerated(self) -> bool:
         """Whether all actions were tried to find it, in an environment that ends its own episodes."""
         return self.truth.startswith(ENUMERATED)
+
+    @property
+    def scope(self) -> str:
+        """How the tables are known, which a verdict about them says."""
+        if self.truth == EXACT:
+            return BY_CONSTRUCTION
+        here = "" if ELSEWHERE in self.truth else ", in this process"
+        if not self.is_enumerated:
+            return f"by its {self.truth}{here}"
+        return f"{self.truth}{here}: as far as its attributes and np_random determine it"
 
     @property
     def default_step_limit(self) -> int | None:

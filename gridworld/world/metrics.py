@@ -133,7 +133,7 @@ def numbers(score: Score) -> dict[str, float]:
 
 def optimal_score(evaluator: Evaluator) -> Score:
     """The score of an optimal policy."""
-    return Score(evaluator.optimal_value, 0.0, True, evaluator.optimum)
+    return Score(evaluator.optimal_value, 0.0, True, evaluator.optimum, evaluator.mdp.scope)
 
 
 def optimal_numbers(evaluator: Evaluator) -> dict[str, float]:

@@ -136,4 +136,4 @@ def space_of_text(text: str, where: str) -> gym.Space[Any]:
         MemoryError,
     ):
         pass
-    raise InputError(f"{where}: own_space is no observation space")
+    raise InputError(f"{where}: own_space is not a space of observations")

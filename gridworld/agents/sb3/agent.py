@@ -92,7 +92,8 @@ def unknown_to_engine(
         if name in arguments and arguments[name] not in values:
             return f"{config.where}.{name}={config.given[name]}"
     if arguments["policy"] not in (algorithm.policy_aliases[name] for name in ("MlpPolicy", "CnnPolicy")):
-        return f"agent.policy={config.policy}"
+        is_dict = arguments["policy"] is algorithm.policy_aliases["MultiInputPolicy"]
+        return "observations that are a Dict" if is_dict else f"agent.policy={config.policy}"
     kwargs, own = arguments.get("policy_kwargs", {}), config.policy_kwargs_given
     for name, classes in _KNOWN_CLASSES.items():
         if name in kwargs and kwargs[name] not in classes:

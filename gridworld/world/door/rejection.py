@@ -69,12 +69,19 @@ class Rejecting(Branching):
         everything: a copy of all attributes and of what it is given.
         runs: the code of the functions that run a reset or a step.
         remembers: whether what follows a draw in a loop is found once, wherever the same comes again.
+        compares: whether shares are compared with real draws.
     """
 
     def __init__(
-        self, where: str, everything: Callable[..., bytes], runs: Iterable[CodeType], remembers: bool = False
+        self,
+        where: str,
+        everything: Callable[..., bytes],
+        runs: Iterable[CodeType],
+        remembers: bool = False,
+        compares: bool = True,
     ) -> None:
         super().__init__(where)
+        self._compares = compares
         self._everything, self._runs = everything, frozenset(runs)
         self._depth = 0
         self._met: dict[Any, Way] = {}  # of each draw in a loop, the way to it
@@ -101,7 +108,7 @@ class Rejecting(Branching):
             pass
         for self._across in (True, False):  # the first is faster, and misled by what is on the stack
             found, places = self._merged(step)
-            if not self._differs(step, found, (self._across, places)):
+            if not (self._compares and self._differs(step, found, (self._across, places))):
                 return found
         self._takes_all = True
         try:

@@ -27,7 +27,7 @@ from gridworld.base.errors import GYMNASIUM, InputError, in_short, on_a_line
 from gridworld.base.user_input import check_memory
 from gridworld.world.door import known
 from gridworld.world.door.beliefs import Step, lumped
-from gridworld.world.door.layers import Changed, Env, Layers, Limited, Timed
+from gridworld.world.door.layers import Changed, Env, Layers, Limited, Timed, attributes
 from gridworld.world.door.observations import leaves
 from gridworld.world.door.rejection import Rejecting
 from gridworld.world.door.word import check_by_word
@@ -85,6 +85,7 @@ class Search:
         state: a function of the environment without wrappers that is all of its state, by the user's word.
         most_states: more are refused.
         most_seconds: what takes longer is refused.
+        compares: whether shares found by rejection are compared with real draws.
     """
 
     def __init__(
@@ -95,9 +96,10 @@ class Search:
         state: Callable[[Any], Any] | None = None,
         most_states: int = MOST_STATES,
         most_seconds: float = MOST_SECONDS,
+        compares: bool = True,
     ) -> None:
         self.where, self.env, self.ignore = where, env, tuple(ignore)
-        self._most_states, self._most_seconds = most_states, most_seconds
+        self._most_states, self._most_seconds, self._compares = most_states, most_seconds, compares
         self._read = state or known.state_reader(env.unwrapped)
         actions = env.action_space
         if not isinstance(actions, spaces.Discrete) or actions.start != 0 or actions.n > MOST_ACTIONS:
@@ -135,7 +137,7 @@ class Search:
 
     def _explored(self, counts_time: bool) -> None:
         runs = (Search.reset_from.__code__, Search.stepped_from.__code__)
-        self.branching = Rejecting(self.where, self._everything, runs, self._read is not None)
+        self.branching = Rejecting(self.where, self._everything, runs, self._read is not None, self._compares)
         self.layers = layers = Layers(self.where, self.env, self.branching, counts_time)
         self._is_complete = counts_time  # nothing that an environment may read is left out
         with layers.restored():
@@ -510,10 +512,19 @@ def traits(env: Env) -> Any:
     branching = Rejecting("env", bytes, ())
     search.layers, search.branching = Layers("env", env, branching), branching
     with search.layers.restored():
+        held = {
+            (number, name): value
+            for number, layer in enumerate(search.layers.layers)
+            for name, value in attributes(layer).items()
+        }
         before = search.layers.values()
         shown = search.walk(np.int64)
         after = search.layers.values()
-    constant = {key: value for key, value in before.items() if after.get(key) == value}
+    constant: dict[Any, Any] = {
+        key: held[key] if isinstance(held[key], gym.Space) else value
+        for key, value in before.items()
+        if after.get(key) == value and held[key] is not branching
+    }
     return [type(each) for each in search.layers.layers], search.layers.limit, constant, shown
 
 

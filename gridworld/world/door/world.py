@@ -58,6 +58,7 @@ def enumerated(
     state: Callable[[Any], Any] | None = None,
     most_states: int = MOST_STATES,
     most_seconds: float = MOST_SECONDS,
+    compares: bool = True,
 ) -> Found:
     """Find the world of an environment, wrappers included, which is left as it was.
 
@@ -69,11 +70,12 @@ def enumerated(
         state: a function of the environment without wrappers that is its whole state, by the user's word.
         most_states: more are refused as soon as they are found.
         most_seconds: a search that takes longer is refused.
+        compares: whether shares found by rejection are compared with real draws.
 
     Raises:
         InputError: it has no such world, or none within these bounds.
     """
-    search = Search(where, env, ignore, state, most_states, most_seconds)
+    search = Search(where, env, ignore, state, most_states, most_seconds, compares)
     search.explore()
     return _World(search, name or type(env.unwrapped).__name__, by_word=state is not None).found
 
