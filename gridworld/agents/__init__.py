@@ -70,6 +70,10 @@ class Agent(ABC):
         """The path of a class of which nobody knows what it keeps, so that `get_state` cannot be complete."""
         return None
 
+    def acts_by(self) -> str | None:
+        """The path of a class whose own `predict` decides on the best action; None: what it learned does."""
+        return None
+
     @abstractmethod
     def get_state(self) -> State:
         """Everything that learning depends on from here, its environments included."""

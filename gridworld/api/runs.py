@@ -40,6 +40,7 @@ from gridworld.training.train import train as train_in
 from gridworld.visualization.files import encode_png
 from gridworld.visualization.picture import Subject, drawer
 from gridworld.world.evaluation import Evaluator, PolicySnapshot
+from gridworld.world.mdp import BY_CONSTRUCTION
 
 if TYPE_CHECKING:  # of most runs nothing is drawn
     from PIL import Image

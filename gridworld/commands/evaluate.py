@@ -16,7 +16,7 @@ from gridworld.envs.rollout import SampledScores, play, sample_episodes
 from gridworld.run.summary import MOST_NAMED, circles_text
 from gridworld.training.saved_run import SavedRun, choose_policy
 from gridworld.world.evaluation import Evaluator, Score
-from gridworld.world.mdp import FloatArray
+from gridworld.world.mdp import BY_CONSTRUCTION, FloatArray
 from gridworld.world.metrics import METRICS, optimal_score
 
 _MOST_EPISODES = 1_000_000
@@ -50,6 +50,8 @@ def main(arguments: Sequence[str]) -> None:
     print(printable(f"{options.policy} policy of {of} on {evaluator.mdp.name}"))
     print(table)
     print(f"  {verdict}")
+    if score.scope != BY_CONSTRUCTION:
+        print(printable(f"  world: {score.scope}"))
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -21,7 +21,8 @@ from gridworld.base.errors import InputError
 from gridworld.config.settings import NEWER, flat, privileges
 from gridworld.run.folder import CURVE, MANIFEST, SUMMARY, VISITS
 from gridworld.run.reader import ONLINE, REQUIRED, RunReader, check_is_folder, read_columns, read_run
-from gridworld.world.mdp import FloatArray
+from gridworld.run.summary import scope_of
+from gridworld.world.mdp import BY_CONSTRUCTION, FloatArray
 from gridworld.world.metrics import METRICS
 
 MOST_ENTRIES = 2_000_000  # files and folders below a given one: some seconds
@@ -34,6 +35,7 @@ REPORTED = sorted(
     (metric for metric in METRICS if metric.in_report), key=lambda each: (*_ORDER, each.name).index(each.name)
 )
 _LONGEST_NAME = 80  # characters
+_LONGEST_SCOPE = 300
 _DIGITS = 9  # after the point: two ways to compute one regret differ later than that
 _KINDS = {str: "a name", int: "a whole number", float: "a number"}
 
@@ -60,6 +62,7 @@ class Evidence:
     pictures: Mapping[str, str]  # as `RunReader.pictures`
     step_limit: Any  # of an episode, as the summary has it
     privileges: Sequence[str]  # as `config.settings.privileges` finds them in its settings
+    scope: str  # how the tables of its world are known; "" by construction
     damage: tuple[str, ...]  # a sentence for each of its other files that is not the one that it wrote
 
     @property
@@ -194,6 +197,7 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
         pictures=run.pictures(),
         step_limit=summary.get("max_episode_steps"),
         privileges=privileges(config),
+        scope="" if (scope := scope_of(summary)) == BY_CONSTRUCTION else printable(scope)[:_LONGEST_SCOPE],
         damage=damaged,
     )
 

@@ -40,6 +40,11 @@ class Group:
         """What its runs had and a learner in the world would not have; "" where that is nothing."""
         return ", ".join(dict.fromkeys(each for run in self.runs for each in run.privileges))
 
+    @property
+    def scope(self) -> str:
+        """How the tables of its world are known; "" by construction."""
+        return "; ".join(dict.fromkeys(run.scope for run in self.runs if run.scope))
+
 
 @dataclass(frozen=True, eq=False)
 class Study:

@@ -186,10 +186,11 @@ def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
 def _table_of(
     results: Sequence[Result], name: str, caption: str, columns: list[str], rows: list[list[Cell]]
 ) -> Table:
-    """A table with a row for each result, and a column of their privileges where any has some."""
-    privileges = [result.group.privileges for result in results]
-    if any(privileges):
-        columns, rows = [*columns, "privileges"], [[*row, privileges[at]] for at, row in enumerate(rows)]
+    """A table with a row for each result, and columns of their privileges and scopes where any has some."""
+    for heading, what in (("privileges", "privileges"), ("the world is known", "scope")):
+        found = [getattr(result.group, what) for result in results]
+        if any(found):
+            columns, rows = [*columns, heading], [[*row, found[at]] for at, row in enumerate(rows)]
     return Table(name, caption, columns, rows)
 
 

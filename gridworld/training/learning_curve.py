@@ -104,7 +104,7 @@ class LearningCurve:
         self.newest: Evaluation | None = None
         self.seconds = 0.0  # spent on evaluation
         self.sinks: list[Sink] = []  # take every evaluation, one after the other
-        self._agent, self._envs = agent, envs
+        self.agent, self._envs = agent, envs
         self._every, self._stop_after = config.evaluation.every, config.evaluation.stop_after
         self._total = config.total_timesteps
         self._next = self._every
@@ -170,7 +170,7 @@ class LearningCurve:
                 self._write(evaluation)
             else:
                 is_best = self.best.is_beaten_by(evaluation.greedy)
-                self._held = evaluation, self._agent.model_file() if is_best else b""
+                self._held = evaluation, self.agent.model_file() if is_best else b""
         if self._stop_after is not None and self.certificate.streak >= self._stop_after:
             return 0
         return self._next if self._held is None else step + 1
@@ -195,7 +195,7 @@ class LearningCurve:
     def _evaluation(self, step: int, returns: Returns) -> Evaluation:
         """Of the agent as it is now."""
         started = time.perf_counter()
-        snapshot = self._agent.snapshot()
+        snapshot = self.agent.snapshot()
         if not (np.isfinite(snapshot.values).all() and np.isfinite(snapshot.sampled).all()):
             raise InputError(
                 f"training diverged: the agent's values are not finite numbers after {step} steps; "
@@ -225,7 +225,7 @@ class LearningCurve:
         is_new = before is None or not np.array_equal(before.snapshot.values, values)
         self.certificate.update(step, evaluation.greedy.certified, is_new)
         if self.best.is_beaten_by(evaluation.greedy):
-            content = self._agent.model_file() if model is None else model
+            content = self.agent.model_file() if model is None else model
             self.best = BestModel(step, evaluation.greedy.shortfall, content)
         for take in self.sinks:
             take(evaluation)

@@ -281,7 +281,7 @@ def _write_scalars(events: EventWriter | None, wandb: Any, values: Mapping[str, 
 
 def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, seconds: float) -> Summary:
     """The fields of `summary.json`, where numbers may be infinite; `seconds` are those of training."""
-    evaluator, certificate = curve.evaluator, curve.certificate
+    evaluator, certificate, acts_by = curve.evaluator, curve.certificate, curve.agent.acts_by()
     mdp = evaluator.mdp
     endless = evaluator.endless_states(last.snapshot.greedy_policy())
     greedy, sampled = (
@@ -292,7 +292,7 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
         "agent": config.agent.name,
         "env": mdp.name,
         **({} if mdp.truth == EXACT else {"truth": mdp.truth}),
-        "scope": mdp.scope,
+        "scope": mdp.scope + ("" if acts_by is None else f"; actions are what {acts_by}.predict answers"),
         "observation": config.observation.kind,
         "seed": config.seed,
         "recipe": config.recipe,

@@ -183,7 +183,7 @@ def test_the_last_row_does_not_stand_on_the_few_episodes_since_the_row_before(
             return next(self.returns)
 
     curve, _ = follow([False, True], f"total_timesteps={total}", envs=Envs())
-    curve._agent.pattern = iter([False])  # type: ignore[attr-defined]
+    curve.agent.pattern = iter([False])  # type: ignore[attr-defined]
     if step > 20:
         curve.on_step(step)
     assert curve.evaluate(step).returns.episodes == episodes

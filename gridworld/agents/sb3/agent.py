@@ -6,6 +6,7 @@ import io
 import traceback
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,14 @@ from gridworld.agents.sb3.callbacks import RunCallback, check_finite, class_with
 from gridworld.agents.sb3.factory import algorithm_and_arguments, failed, make_callbacks, make_model, unfit
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.model_file import read_model
-from gridworld.agents.sb3.policy_outputs import explored, read_table, why_no_table
+from gridworld.agents.sb3.policy_outputs import (
+    explored,
+    predicted,
+    predicts_by,
+    read_table,
+    why_no_table,
+    why_unsteady,
+)
 from gridworld.agents.sb3.replay_counts import ReplayCounts
 from gridworld.agents.sb3.settings import SB3Config
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
@@ -121,7 +129,13 @@ class SB3Agent(Agent):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # which come again while it learns
-                why = why_no_table(self._model.policy, self.observation)
+                model, policy, mdp = self._model, self._model.policy, self._envs.mdp
+                why = why_no_table(policy, self.observation)
+                if why is None and self.acts_by() is not None:
+                    acting = np.flatnonzero(mdp.acting)
+                    why = why_unsteady(model, policy, self.observation, acting, mdp.num_actions)
+        except InputError as error:
+            raise unfit(self.config, f"cannot be evaluated: {error!s}") from None
         except Exception as error:  # the class may be anybody's
             raise failed(self.config, "cannot be evaluated", error) from error
         if why is not None:
@@ -156,8 +170,15 @@ class SB3Agent(Agent):
     def get_state(self) -> State:
         return get_state(self._model, self._callbacks)
 
+    def acts_by(self) -> str | None:
+        return predicts_by(self._model, self._model.policy)
+
     def snapshot(self) -> PolicySnapshot:
-        return self._snapshot(*read_table(self._model.policy, self.observation))
+        found = self._snapshot(*read_table(self._model.policy, self.observation))
+        if self.acts_by() is None:
+            return found
+        actions = predicted(self._model, self.observation, found.sampled.shape[1])
+        return replace(found, greedy=actions)
 
     def _snapshot(
         self, values: FloatArray, probabilities: FloatArray | None, q: FloatArray | None

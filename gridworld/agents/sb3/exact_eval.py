@@ -19,32 +19,28 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped, sync_envs_normalization
 
 from gridworld.agents.sb3.policy_outputs import (
-    CHUNK,
-    NO_TABLE,
+    LIBRARIES,
     explored,
+    predicted,
+    predicts_by,
     read_table,
-    why_no_table,
     why_unreadable,
+    why_unsteady,
 )
 from gridworld.base.atomic_write import replacing
 from gridworld.base.bounds import Bounds, discount
-from gridworld.base.errors import InputError, in_short, on_a_line
+from gridworld.base.errors import InputError, on_a_line
 from gridworld.config.compose import named_world
 from gridworld.envs.inspection import Task, equal, observation_like, tabulated, task_of
 from gridworld.envs.observations import KINDS, ObservationTable
 from gridworld.run.folder import BEST_MODEL, EVALUATIONS
 from gridworld.run.writer import write_evaluations
 from gridworld.world.chain import one_hot_policy
-from gridworld.world.door.layers import random_states
 from gridworld.world.evaluation import Evaluator
-from gridworld.world.mdp import FloatArray, IntArray
+from gridworld.world.mdp import FloatArray
 from gridworld.world.metrics import numbers
 from gridworld.world.shown import channels_first
 
-_LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.", "torch.")
-_ONE_BY_ONE = 512  # states in which `predict` is asked alone, too
-_OFTEN = 100  # times, where `predict` is a custom one
-_PREDICTS = ("predict", "_predict")  # what decides an action, of a model or a policy
 _KINDS: dict[str, type] = {"step": np.int64, "certified": np.bool_}
 
 
@@ -91,7 +87,9 @@ class ForeignPolicy:
         assert outputs is not None
         if not np.isfinite(outputs).all():
             raise InputError("the model's outputs are not finite numbers; its training has diverged")
-        greedy = one_hot_policy(self._predicted(observation), outputs.shape[1])
+        greedy = one_hot_policy(
+            predicted(self._model, observation, outputs.shape[1], self._masks), outputs.shape[1]
+        )
         self._policy.set_training_mode(was_training)
         epsilon = float(getattr(self._model, "exploration_rate", 0.0))
         sampled = outputs if q is None else explored(greedy, epsilon)
@@ -136,52 +134,17 @@ class ForeignPolicy:
             )
         self._guess_is_fine = True
 
-    def _predicted(self, observation: ObservationTable) -> IntArray:
-        """(S,), the actions that `predict` takes, asked in batches."""
-        states = np.arange(observation.num_states)
-        starts = range(0, len(states), CHUNK)
-        return np.concatenate([self._predict(observation, states[at : at + CHUNK]) for at in starts])
-
-    def _predict(self, observation: ObservationTable, states: IntArray) -> IntArray:
-        """(n,), the actions of some states; `states` is one number to ask as for a single environment."""
-        masks = {} if self._masks is None else {"action_masks": self._masks[states]}
-        try:
-            found = self._model.predict(observation.rows(states), deterministic=True, **masks)
-            actions, state = np.asarray(found[0]), found[1]
-        except Exception as error:  # it may be anybody's own
-            raise InputError(f"the model: its predict() raised {in_short(error)}") from error
-        if state is not None:
-            raise InputError(f"the model: its predict() keeps a state between steps, {NO_TABLE}")
-        fits = actions.shape == np.shape(states) and actions.dtype.kind in "iu"
-        if not fits or not np.isin(actions, np.arange(self._task.mdp.num_actions)).all():
-            raise InputError(
-                f"the model: its predict() returned {str(actions)[:60]} for {np.size(states)} states; must "
-                f"be an action per state, {self._task.mdp.action_choices()}"
-            )
-        return actions
-
     def _check_is_a_table(self, observation: ObservationTable) -> None:
-        was_training, before = self._policy.training, random_states()
-        reached = np.flatnonzero(self._task.mdp.acting)[:_ONE_BY_ONE]
-        together = self._predicted(observation)[reached]
-        rounds = [np.array([self._predict(observation, state) for state in reached])]
-        rounds += [self._predicted(observation)[reached] for _ in range(1 if self._is_known else _OFTEN)]
-        reason = why_no_table(self._policy, observation)
-        self._policy.set_training_mode(was_training)
-        if reason is None and random_states() != before:
-            reason = f"draws random numbers for its best action, {NO_TABLE}"
-        if reason is None and any((each != together).any() for each in rounds):
-            reason = f"does not always take the same action in the same state, {NO_TABLE}"
-        if reason is not None:
+        acting = np.flatnonzero(self._task.mdp.acting)
+        asked = self._model, self._policy, observation, acting, self._task.mdp.num_actions, self._masks
+        if (reason := why_unsteady(*asked)) is not None:
             raise InputError(f"the model {reason}")
 
 
 def _is_of_a_library(model: Any, policy: BasePolicy) -> bool:
     """Whether no custom layer or `predict` decides on an action."""
-    methods = [getattr(type(thing), name, None) for thing in (model, policy) for name in _PREDICTS]
-    modules = [each.__module__ for each in (*map(type, policy.modules()), *filter(None, methods))]
-    is_replaced = any(name in vars(thing) for thing in (model, policy) for name in _PREDICTS)
-    return not is_replaced and all(module.startswith(_LIBRARIES) for module in modules)
+    layers = (type(each).__module__ for each in policy.modules())
+    return predicts_by(model, policy) is None and all(each.startswith(LIBRARIES) for each in layers)
 
 
 class ExactEvalCallback(BaseCallback):

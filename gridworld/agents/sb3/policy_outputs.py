@@ -5,6 +5,7 @@ An actor-critic has action probabilities and values, others have Q values or the
 
 from __future__ import annotations
 
+import inspect
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -12,13 +13,19 @@ import torch
 from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor, nn
 
+from gridworld.base.errors import InputError, in_short
 from gridworld.envs.observations import ObservationTable
-from gridworld.world.mdp import BoolArray, FloatArray
+from gridworld.world.door.layers import random_states
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 CHUNK = 4096  # states a forward pass
 _ASKED = 512  # states
 _PART = 3
 NO_TABLE = "so it cannot be evaluated exactly"
+LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.", "torch.")
+_PREDICTS = ("predict", "_predict")  # what decides an action, of a model or a policy
+_ONE_BY_ONE = 512  # states in which `predict` is asked alone, too
+_OFTEN = 100  # times, where `predict` is a custom one
 
 
 class Reading(NamedTuple):
@@ -97,3 +104,81 @@ def explored(greedy: FloatArray, epsilon: float) -> FloatArray:
 
 def _is_actor_critic(policy: BasePolicy) -> bool:
     return hasattr(policy, "get_distribution") and hasattr(policy, "predict_values")
+
+
+def predicts_by(model: Any, policy: BasePolicy) -> str | None:
+    """The path of a class whose own `predict` decides on an action; None: the libraries' does."""
+    for thing in (model, policy):
+        for name in _PREDICTS:
+            method = getattr(type(thing), name, None)
+            if name in vars(thing) or not getattr(method, "__module__", LIBRARIES[0]).startswith(LIBRARIES):
+                return f"{type(thing).__module__}.{type(thing).__qualname__}"
+    return None
+
+
+def predicted(
+    model: Any, observation: ObservationTable, actions: int, masks: BoolArray | None = None, **more: Any
+) -> IntArray:
+    """(S,), the actions that `predict` takes in all states, asked in batches."""
+    states = np.arange(observation.num_states)
+    starts = range(0, len(states), CHUNK)
+    asked = (states[at : at + CHUNK] for at in starts)
+    return np.concatenate([_predicted(model, observation, actions, masks, each, **more) for each in asked])
+
+
+def _predicted(
+    model: Any, observation: ObservationTable, actions: int, masks: Any, states: Any, **more: Any
+) -> IntArray:
+    """(n,), the actions in some states; `states` is one number to ask as for a single environment."""
+    if masks is not None:
+        more["action_masks"] = masks[states]
+    try:
+        found = model.predict(observation.rows(states), deterministic=True, **more)
+        taken, state = np.asarray(found[0]), found[1]
+    except Exception as error:  # it may be anybody's own
+        raise InputError(f"the model: its predict() raised {in_short(error)}") from error
+    if state is not None:
+        raise InputError(f"the model: its predict() keeps a state between steps, {NO_TABLE}")
+    fits = taken.shape == np.shape(states) and taken.dtype.kind in "iu"
+    if not fits or not np.isin(taken, np.arange(actions)).all():
+        raise InputError(
+            f"the model: its predict() returned {str(taken)[:60]} for {np.size(states)} states; must be an "
+            f"action per state, from 0 to {actions - 1}"
+        )
+    return taken
+
+
+def why_unsteady(
+    model: Any,
+    policy: BasePolicy,
+    observation: ObservationTable,
+    acting: IntArray,
+    actions: int,
+    masks: BoolArray | None = None,
+) -> str | None:
+    """Why `predict` is not a function of what it is shown: asked alone and together, in two orders, again.
+
+    `acting` are the states of interest. It is left as it was.
+    """
+    was_training, before = policy.training, random_states()
+    some = acting[:_ONE_BY_ONE]
+    together = predicted(model, observation, actions, masks)[some]
+
+    def alone(states: IntArray) -> IntArray:
+        return np.array([_predicted(model, observation, actions, masks, state) for state in states])
+
+    rounds = [alone(some), alone(some[::-1])[::-1]]
+    is_own = predicts_by(model, policy) is not None
+    rounds += [predicted(model, observation, actions, masks)[some] for _ in range(_OFTEN if is_own else 1)]
+    if is_own and "episode_start" in inspect.signature(model.predict).parameters:
+        for value in (True, False):
+            begins = np.full(observation.num_states, value)[:CHUNK]
+            if observation.num_states <= CHUNK:
+                rounds.append(predicted(model, observation, actions, masks, episode_start=begins)[some])
+    reason = why_no_table(policy, observation)
+    policy.set_training_mode(was_training)
+    if reason is None and random_states() != before:
+        reason = f"draws random numbers for its best action, {NO_TABLE}"
+    if reason is None and any((each != together).any() for each in rounds):
+        reason = f"does not always take the same action in the same state, {NO_TABLE}"
+    return reason

@@ -17,6 +17,7 @@ from helpers.own_class import OWN_CLASS, any_class, importable
 from helpers.resuming import begin, differences, go_on, left_behind, rows, stopped_after
 from helpers.support import NO_FILES, SHORT, configure, script
 
+import gridworld
 from gridworld.agents.sb3.model_file import read_weights
 from gridworld.base.errors import InputError
 from gridworld.run.checkpoints import Checkpoints
@@ -108,6 +109,22 @@ class SavedShifting(Shifting):
         self.shift = state["shift"]
 
 class Remembering(ReplayBuffer): pass
+
+class Contrary(A2C):  # does not do what its network says
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        actions, _ = super().predict(observation, state, episode_start, deterministic)
+        return (actions + 1) % 4, None
+
+class Starting(A2C):  # does another thing where an episode begins
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        actions, _ = super().predict(observation, state, episode_start, deterministic)
+        return (actions if episode_start is None or not episode_start.any() else 0 * actions + 3), None
+
+class Alternating(A2C):  # every other time
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        self.asked = 1 + getattr(self, "asked", 0)
+        actions, _ = super().predict(observation, state, episode_start, deterministic)
+        return (actions + self.asked % 2) % 4, None
 """
 LESS = ["recording.frames=false", "recording.gif=false"]
 STIRRING = "callbacks=[{_target_: own_code.Stirring, every: 3}]"
@@ -315,3 +332,21 @@ def test_what_only_the_class_can_judge_is_refused_in_a_sentence(
     assert sentence in told
     assert bool(sentence) == bool(told)
     assert "\n" not in told
+
+
+def test_a_run_scores_what_predict_does(tmp_path: Path) -> None:
+    run = gridworld.train(*any_class("own_code.Contrary"), *NO_FILES, folder=tmp_path / "run")
+    greedy = run.policy.greedy
+    rows = run.model.observation_space.shape[0]
+    network, _ = (
+        type(run.model).__mro__[1].predict(run.model, np.eye(rows, dtype=np.float32), deterministic=True)
+    )
+    assert np.array_equal(greedy, (network + 1) % 4)
+    assert gridworld.evaluate(run.model, "classic").regret == pytest.approx(run.summary["regret"], abs=1e-12)
+    assert run.summary["scope"] == "by construction; actions are what own_code.Contrary.predict answers"
+
+
+@pytest.mark.parametrize("name", ["Starting", "Alternating"])
+def test_a_predict_that_is_not_a_function_of_the_state_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not always take the same action in the same state"):
+        gridworld.train(*any_class(f"own_code.{name}"), *NO_FILES, folder=tmp_path / "run")
