@@ -137,10 +137,10 @@ class EnumeratedConfig(GymnasiumConfig):
 
 @dataclass
 class ArraysConfig(EnvConfig):
-    """Tables in a file."""
+    """Tables or matrices in a file, or a model in Cassandra's format."""
 
     source: Word = "arrays"
-    path: FilePath = MISSING  # of an .npz
+    path: FilePath = MISSING  # of an .npz, .mat, .MDP or .POMDP
 
     @property
     def name(self) -> str:
