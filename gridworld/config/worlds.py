@@ -14,7 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 from gridworld.base.bounds import MOST_STEPS, STEP_LIMIT
 from gridworld.base.errors import InputError
-from gridworld.config.fields import MISSING, BuilderPath, EnvId, FilePath, Kwargs, Word, bounds, setting
+from gridworld.config.fields import (
+    MISSING,
+    BuilderPath,
+    EnvId,
+    FilePath,
+    Kwargs,
+    Rewards,
+    Word,
+    bounds,
+    setting,
+)
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
     from gridworld.world.grid import GridMdp
@@ -66,6 +76,8 @@ class MapConfig(EnvConfig):
     goal_reward: float = 1.0  # paid for entering a goal, which ends the episode
     trap_reward: float = -1.0  # for entering a trap, which ends it too, or a cliff, which does not
     max_episode_steps: int | None = 100  # the step limit: then the episode is cut
+    # of ends with letters of their own, as {A: 10, B: -1}, in place of those in the map
+    rewards: Rewards = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -74,7 +86,7 @@ class MapConfig(EnvConfig):
     def compile(self) -> GridMdp:
         from gridworld.world.layout import load
 
-        return self.compile_on(load(self.layout, self.num_rows, self.num_cols))
+        return self.compile_on(load(self.layout, self.num_rows, self.num_cols, self.rewards))
 
     def compile_on(self, layout: Layout) -> GridMdp:
         """Compile the world with this map in place of the configured one."""

@@ -118,9 +118,9 @@ class _Text:
             self.names[kind] = [checked_text(self.where, f"the name of a {kind}", each) for each in given]
             self._places[kind] = {each: number for number, each in enumerate(given)}
         elif key == "values":
-            if given not in (["reward"], ["cost"]):
+            if given not in (["reward"], ["rewards"], ["cost"], ["costs"]):
                 self._refuse("values must be reward or cost")
-            self._factor = -1.0 if given == ["cost"] else 1.0
+            self._factor = -1.0 if given[0].startswith("cost") else 1.0
         elif len(given) != 1 or not _NUMBER.fullmatch(given[0]) or not 0 <= float(given[0]) <= 1:
             self._refuse("discount must be a number from 0 to 1")
 
