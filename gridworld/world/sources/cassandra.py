@@ -112,9 +112,7 @@ class _Text:
             elif len(set(given)) < len(given) or any(each[0] in "0123456789*:" for each in given):
                 given = []
             if not 0 < len(given) <= MOST_STATES:
-                self._refuse(
-                    f"{key} must be how many there are, from 1 to {MOST_STATES:,}, or different names"
-                )
+                self._refuse(f"{key} must be how many, from 1 to {MOST_STATES:,}, or different names")
             self.names[kind] = [checked_text(self.where, f"the name of a {kind}", each) for each in given]
             self._places[kind] = {each: number for number, each in enumerate(given)}
         elif key == "values":
@@ -190,8 +188,10 @@ class _Text:
             while len(values) <= wanted and _NUMBER.fullmatch(self._next):
                 values.append(float(self._advance()))
             if len(values) != wanted:
-                found = "more" if len(values) > wanted else f"{len(values)}, then {self._next[:50]!r}"
-                self._refuse(f"{wanted} numbers must be here for {key}, not {found}")
+                found = f"{len(values)}, and then {self._next[:50]!r}" if len(values) <= wanted else "more"
+                self._refuse(f"{key} needs {wanted} number{'s' * (wanted > 1)} here, not {found}")
+            if not np.isfinite(values).all():
+                self._refuse(f"{key} has a number here that is too large")
             self.tables[key][tuple(index)] = (self._factor if key == "R" else 1.0) * np.reshape(values, shape)
             return
         self._advance()
@@ -203,7 +203,7 @@ def _of_beliefs(where: str, model: _Text, actions: list[str]) -> Mdp:
 
     def refusal(reason: str) -> InputError:
         return InputError(
-            f"{where}: {reason.partition(';')[0]}; only a POMDP with few enough of them is a world"
+            f"{where}: {reason.partition(';')[0]}; only a POMDP with few enough beliefs is a world"
         )
 
     leads_to, shows = (_exact(model.tables[key]) for key in ("T", "O"))

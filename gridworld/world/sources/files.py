@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError, in_short
-from gridworld.base.user_input import COPIES, DAMAGED, check_memory
+from gridworld.base.user_input import COPIES, check_memory
 from gridworld.world.mdp import FloatArray
 from gridworld.world.outcomes import (
     Outcomes,
@@ -97,6 +97,7 @@ def normal(
             f"{where}: {what} of action {called[0]}, state {called[1]} has the sum "
             f"{total[action, state]:.9g}; must be probabilities with the sum 1"
         )
+    total[np.abs(total - 1) <= 1e-12] = 1  # decimals that sum to 1 stay as they are
     return np.asarray(table / total[..., None])
 
 
@@ -114,7 +115,7 @@ def mat_arrays(content: bytes, where: str) -> dict[str, Any]:
         raise InputError(f"{where}: is a .mat of version 7.3; save it with -v7") from None
     except InputError:
         raise
-    except (*DAMAGED, zlib.error) as error:
+    except Exception as error:  # scipy has many for what is damaged
         raise InputError(f"{where}: not a .mat that can be read ({in_short(error)})") from None
     arrays = {key: dense(where, key, found[key]) for key in ("P", "R", "start") if key in found}
     is_numbers = all(np.asarray(each).dtype.kind in _NUMBERS for each in arrays.values())
