@@ -174,7 +174,7 @@ def _paid(name: str, heading: str, rewards: Mapping[str, float]) -> dict[str, fl
     for letter in (paid := paid | dict(rewards)):
         if not re.fullmatch("[A-Z]", str(letter)) or letter in _TILES:
             known = ", ".join(filter(str.isalpha, _TILES))
-            raise InputError(f"{name}: {str(letter)[:20]!r} is no end's letter; use A to Z, but not {known}")
+            raise InputError(f"{name}: {str(letter)[:20]!r} cannot be an end; use A to Z, but not {known}")
     return {letter: checked_reward(f"{name}: reward of {letter}", each) for letter, each in paid.items()}
 
 

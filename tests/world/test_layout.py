@@ -108,9 +108,9 @@ def test_rewards_are_given_or_replaced(tmp_path):
     assert make_vec_env(str(path), rewards=changed).envs.mdp.reward[1, 1, 0] == -0.125
     for wrong, mistake in (
         ({**changed, "D": 1}, "the end 'D' is not on the map; mark its cells or leave out its reward"),
-        ({**changed, "G": 1}, "'G' is no end's letter; use A to Z, but not S, G, T, C, H, F"),
+        ({**changed, "G": 1}, "'G' cannot be an end; use A to Z, but not S, G, T, C, H, F"),
         ({**changed, "A": "x"}, "reward of A=x: must be a finite number"),
-        (3, "rewards=3: must be rewards by letters"),
+        (3, "rewards=3: must be a mapping of letters to rewards"),
     ):
         with pytest.raises(InputError, match=mistake):
             load(path, rewards=wrong)
@@ -127,8 +127,8 @@ def test_rewards_are_given_or_replaced(tmp_path):
         (b"A=\nSA\n", r"first line: 'A=' is not the reward"),
         (b"A=nan\nSA\n", r"reward of A=nan: must be a finite number"),
         (b"A=1e200\nSA\n", r"reward of A=1e\+200: must be 0, or from"),
-        (b"a=1\nSa\n", r"'a' is no end's letter; use A to Z, but not S, G, T, C, H, F"),
-        (b"A=1 T=1\nSA\n", r"'T' is no end's letter"),
+        (b"a=1\nSa\n", r"'a' cannot be an end; use A to Z, but not S, G, T, C, H, F"),
+        (b"A=1 T=1\nSA\n", r"'T' cannot be an end"),
         (b"A=1\n", r"there is no map below the rewards of its ends"),
         (b"A=1\nSG\n", r"the end 'A' is not on the map"),
         (b"SAG\n", r"row 1, column 2: unknown tile 'A'.* or give the reward of an end in the first line"),

@@ -162,7 +162,8 @@ class _Text:
         places = self._places[_CALLED[axis]]
         number = int(word) if re.fullmatch(r"\d{1,6}", word, re.ASCII) else len(places)
         if word not in places and number >= len(places):
-            self._refuse(f"{word[:50]!r} is no {_CALLED[axis]}; must be a name, or 0 to {len(places) - 1}")
+            known = f"must be a name or a number up to {len(places) - 1}"
+            self._refuse(f"unknown {_CALLED[axis]} {word[:50]!r}; {known}")
         return places.get(word, number)
 
     def _entry(self, key: str) -> None:
