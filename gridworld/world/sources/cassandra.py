@@ -14,7 +14,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 
@@ -177,7 +177,7 @@ class _Text:
             index.append(self._index(axis, self._advance()))
         shape = self.tables[key].shape[len(index) :]
         keyword = (self._next, key, len(shape))
-        values: Any
+        values: FloatArray
         if self._next == "uniform" and key != "R" and shape:
             values = np.full(shape, 1 / shape[-1])
         elif keyword == ("identity", "T", 2):
@@ -185,18 +185,22 @@ class _Text:
         elif keyword == ("reset", "T", 1):
             values = np.full(shape, 1 / shape[-1]) if self.start is None else self.start
         else:
-            values, wanted = [], math.prod(shape)
-            while len(values) <= wanted and _NUMBER.fullmatch(self._next):
-                values.append(float(self._advance()))
-            if len(values) != wanted:
-                found = f"{len(values)}, and then {self._next[:50]!r}" if len(values) <= wanted else "more"
-                self._refuse(f"{key} needs {wanted} number{'s' * (wanted > 1)} here, not {found}")
-            if not np.isfinite(values).all():
-                self._refuse(f"{key} has a number here that is too large")
-            self.tables[key][tuple(index)] = (self._factor if key == "R" else 1.0) * np.reshape(values, shape)
+            self.tables[key][tuple(index)] = self._numbers(key, shape)
             return
         self._advance()
         self.tables[key][tuple(index)] = values
+
+    def _numbers(self, key: str, shape: tuple[int, ...]) -> FloatArray:
+        """The numbers that come next, which are this many."""
+        values, wanted = list[float](), math.prod(shape)
+        while len(values) <= wanted and _NUMBER.fullmatch(self._next):
+            values.append(float(self._advance()))
+        if len(values) != wanted:
+            found = f"{len(values)}, and then {self._next[:50]!r}" if len(values) <= wanted else "more"
+            self._refuse(f"{key} needs {wanted} number{'s' * (wanted > 1)} here, not {found}")
+        if not np.isfinite(values).all():
+            self._refuse(f"{key} has a number here that is too large")
+        return (self._factor if key == "R" else 1.0) * np.reshape(values, shape)
 
 
 def _of_beliefs(where: str, model: _Text, actions: list[str]) -> Mdp:

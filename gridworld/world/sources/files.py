@@ -21,28 +21,24 @@ from numpy.typing import NDArray
 from gridworld.base.errors import InputError, in_short
 from gridworld.base.user_input import COPIES, check_memory
 from gridworld.world.mdp import FloatArray
-from gridworld.world.outcomes import (
-    Outcomes,
-    absorbing_states,
-    check_size,
-)
+from gridworld.world.outcomes import Outcomes, absorbing_states, check_size
 
 ROUNDING = 1e-5  # how far a sum of probabilities in a file may be from 1, as in pomdp-solve
 _MOST_UNPACKED = 2**30
 _GROWTH = 8  # of a number of MATLAB's when it is read: one byte may become a double
-_NUMBERS = "fiub"
+_NUMBERS = "fiub"  # of dtypes
 
 
 def dense(where: str, key: str, value: Any) -> Any:
-    """`P` or `R` as one array, if it is a sparse matrix, or a list of matrices of which some are sparse."""
+    """`P` or `R` as one array, if it is a sparse matrix, one for each action, or MATLAB's cells."""
     from scipy import sparse
 
     if sparse.issparse(value):
         check_size(where, value.shape[0], 1, value.shape[-1])
         return value.toarray()
-    is_list = isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.dtype.kind == "O")
-    parts = list(np.ravel(value) if isinstance(value, np.ndarray) else value) if is_list else []
-    if not any(sparse.issparse(part) or isinstance(part, np.ndarray) for part in parts):
+    is_cells = isinstance(value, np.ndarray) and value.dtype.kind == "O"
+    parts = list(value.ravel() if is_cells else value) if is_cells or isinstance(value, list | tuple) else []
+    if not any(sparse.issparse(part) or (is_cells and isinstance(part, np.ndarray)) for part in parts):
         return value
     shape = np.shape(parts[0])
     if len(shape) != 2 or any(np.shape(part) != shape for part in parts):
@@ -60,13 +56,12 @@ def outcomes_of_matrices(
         raise InputError(f"{where}: P is {transition.dtype} {shape}, must be numbers (A, S, S)")
     actions, size, _ = shape
     check_size(where, size, actions, size)
-    forms = {(size,): "s", (size, actions): "sa", shape: "ast"}
-    if reward.shape not in forms or reward.dtype.kind not in _NUMBERS:
+    if reward.shape not in ((size,), (size, actions), shape) or reward.dtype.kind not in _NUMBERS:
         wanted = f"({size}, {actions}), {shape} or ({size},)"
         raise InputError(f"{where}: R is {reward.dtype} {reward.shape}, must be numbers {wanted}")
-    axes = forms[reward.shape]
-    paid = np.einsum(f"{axes}->{''.join(sorted(axes))}", reward.astype(np.float64))
-    paid = np.broadcast_to(paid.reshape([shape["ast".index(a)] if a in axes else 1 for a in "ast"]), shape)
+    if reward.ndim < 3:
+        reward = reward[None, :, None] if reward.ndim == 1 else reward.T[:, :, None]
+    paid = np.broadcast_to(reward, shape).astype(np.float64)
     chance = np.swapaxes(normal(where, "P", transition.astype(np.float64)), 0, 1)
     most = int(np.count_nonzero(chance, axis=2).max())
     following = np.argsort(chance == 0, axis=2, kind="stable")[:, :, :most]
@@ -128,7 +123,7 @@ def mat_arrays(content: bytes, where: str) -> dict[str, Any]:
         is_ours = chance.shape[1] == chance.shape[2] and np.allclose(chance.sum(axis=2), 1, atol=ROUNDING)
         if not is_ours:
             chance, paid = np.moveaxis(chance, 2, 0), np.moveaxis(paid, 2, 0) if paid.ndim == 3 else paid
-    arrays |= {"P": chance, "R": paid.ravel() if paid.ndim == 2 and 1 in paid.shape else paid}
+    arrays |= {"P": chance, "R": paid.ravel() if paid.ndim == 2 and paid.size == chance.shape[1] else paid}
     return arrays | ({"start": np.ravel(arrays["start"])} if "start" in arrays else {})
 
 
@@ -141,10 +136,10 @@ def _unpacked(content: bytes) -> int:
         kind, length = struct.unpack_from(f"{order}II", content, place)
         place += 8
         if kind == 15:  # miCOMPRESSED
-            packed = zlib.decompressobj()
-            part = packed.decompress(content[place : place + length], 2**20)
-            while part and size <= _MOST_UNPACKED:
-                size += len(part)
-                part = packed.decompress(packed.unconsumed_tail, 2**20)
+            packed, end = zlib.decompressobj(), min(place + length, len(content))
+            for at in range(place, end, 2**16):  # of which zlib makes at most 64 MiB
+                size += len(packed.decompress(content[at : min(at + 2**16, end)]))
+                if size > _MOST_UNPACKED:
+                    break
         place += length
     return size
