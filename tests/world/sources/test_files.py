@@ -243,6 +243,39 @@ def test_what_is_wrong_with_a_text_is_told_with_its_line(tmp_path, text, told):
     assert "\n" not in str(raised.value)
 
 
+def test_decimals_are_exact(tmp_path):
+    rows = "T: *\n0.7 0.2 0.1\n0.333333 0.333333 0.333333\n0 0 1\n"
+    mdp = load_world(written(tmp_path, "thirds.mdp", f"states: a b c\nactions: 1\n{rows}R: * : * : * 1"))
+    assert mdp.probability[0, 0].tolist() == [0.7, 0.2, 0.1]
+    assert mdp.probability[1, 0] == pytest.approx([1 / 3] * 3, abs=1e-15)
+
+
+def test_beliefs_of_thirds_have_an_end(tmp_path):
+    text = """
+        states: a b c
+        actions: 1
+        observations: 2
+        start: a
+        T: *
+        0.333333 0.333333 0.333333
+        0.666667 0.333333 0.0
+        0.333333 0.333333 0.333333
+        O: * : * : 0 1
+        O: 0 : c
+        0.1 0.9
+        O: 0 : b
+        0.0 1.0
+        R: * : a : * : * 1
+        """
+    with pytest.raises(InputError, match="thirds.pomdp: its observations do not show its state"):
+        load_world(written(tmp_path, "thirds.pomdp", text))
+    mdp = load_world(
+        written(tmp_path, "thirds.pomdp", text.replace("0.666667 0.333333 0.0", "0.333333 " * 3))
+    )
+    assert mdp.truth.startswith("exact, 3 beliefs about 3 hidden states")
+    assert sorted(mdp.probability[0, 0]) == pytest.approx([1.1 / 3, 1.9 / 3], abs=1e-15)
+
+
 # Kaelbling, Littman and Cassandra, Planning and acting in partially observable stochastic domains, 1998
 TIGER = """
 discount: 0.75
