@@ -208,8 +208,8 @@ def _store_schemas() -> None:
         store.store(group="agent/schema", name=name, node=schema)
     for name, source in SOURCES.items():
         node = cast(DictConfig, OmegaConf.structured(source))
-        if "kwargs" in node:
-            OmegaConf.set_struct(node.kwargs, False)  # which takes any name without a plus
+        for key in {"kwargs", "rewards"}.intersection(node):
+            OmegaConf.set_struct(node[key], False)  # which takes any name without a plus
         store.store(group="env/schema", name=name, node=node)
 
 

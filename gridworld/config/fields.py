@@ -124,6 +124,7 @@ EnvId = Annotated[str, Text.ENV]
 Callback = Annotated[Any, Text.CALLBACK]
 Contact = Annotated[bool, Text.SERVER]
 Arguments = Annotated[dict[str, Any], Text.ARGUMENTS]
+Rewards = Annotated[dict[str, float], Text.WORD]
 Kwargs = Annotated[dict[str, Any], Text.KWARGS]
 Schedule = int | float | Word
 WholeNumbers = Annotated[Any, Text.WORD, "a whole number, or lists and dicts of them"]

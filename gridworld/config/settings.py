@@ -40,7 +40,7 @@ from gridworld.config.worlds import SOURCES, EnvConfig, schema_of
 NEWER = frozenset(
     {
         *("callbacks", "exploration_bonus", "exploring_starts", "stratified_draws"),
-        *("agent.reward_scale", "observation.features"),
+        *("agent.reward_scale", "env.rewards", "observation.features"),
     }
 )
 ON_RESULT = frozenset(Effect) - {Effect.FILES, Effect.NOTHING}

@@ -23,6 +23,7 @@ from gridworld.config.fields import (
     EnvId,
     FilePath,
     Kwargs,
+    Rewards,
     Word,
     affects,
     bounds,
@@ -79,6 +80,8 @@ class MapConfig(EnvConfig):
     goal_reward: float = 1.0  # paid for entering a goal, which ends the episode
     trap_reward: float = -1.0  # for entering a trap, which ends it too, or a cliff, which does not
     max_episode_steps: int | None = 100  # the step limit: then the episode is cut
+    # of ends with letters of their own, as {A: 10, B: -1}, in place of those in the map
+    rewards: Rewards = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -87,7 +90,7 @@ class MapConfig(EnvConfig):
     def compile(self) -> GridMdp:
         from gridworld.world.layout import load
 
-        return self.compile_on(load(self.layout, self.num_rows, self.num_cols))
+        return self.compile_on(load(self.layout, self.num_rows, self.num_cols, self.rewards))
 
     def compile_on(self, layout: Layout) -> GridMdp:
         """Compile the world with this map in place of the configured one."""
@@ -161,10 +164,10 @@ class EnumeratedConfig(GymnasiumConfig):
 
 @dataclass
 class ArraysConfig(EnvConfig):
-    """Tables in a file."""
+    """Tables or matrices in a file, or a model in Cassandra's format."""
 
     source: Word = "arrays"
-    path: FilePath = MISSING  # of an .npz
+    path: FilePath = MISSING  # of an .npz, .mat, .MDP or .POMDP
 
     @property
     def name(self) -> str:

@@ -10,7 +10,7 @@ import math
 import operator
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from numbers import Real
 from os import PathLike
@@ -44,6 +44,7 @@ class GridWorldEnv(gym.Env[int, int]):
 
     ## Rewards
     `step_reward` (default 0) plus the reward of the cell entered: goal +1, trap -1, any other 0.
+    A map may have ends with rewards of their own.
 
     ## Starting State
     The cell marked as the start; one of them, drawn uniformly, where there are several. With `mdp`, its own
@@ -63,6 +64,7 @@ class GridWorldEnv(gym.Env[int, int]):
     - `step_reward`: paid for every step.
     - `goal_reward`: paid for entering a goal.
     - `trap_reward`: paid for entering a trap or a cliff.
+    - `rewards`: paid for entering ends with letters of their own, by letters, in place of the map's.
     - `cell_size`: pixels a cell in the picture.
     - `mdp`: a compiled world, in place of all arguments that describe one.
 
@@ -84,6 +86,7 @@ class GridWorldEnv(gym.Env[int, int]):
         step_reward: float = 0.0,
         goal_reward: float = 1.0,
         trap_reward: float = -1.0,
+        rewards: Mapping[str, float] | None = None,
         cell_size: int = CELL_SIZE,
         mdp: Mdp | None = None,
     ) -> None:
@@ -91,7 +94,9 @@ class GridWorldEnv(gym.Env[int, int]):
             raise InputError(f"render_mode={render_mode!r}: must be human, rgb_array, ansi or None")
         if isinstance(delay, bool) or not isinstance(delay, Real) or not 0 <= delay < math.inf:
             raise InputError(f"delay={delay!r}: must be a number of seconds, at least 0")
-        world = mdp_or_compiled(mdp, layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward)
+        world = mdp_or_compiled(
+            mdp, layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward, rewards
+        )
         if not isinstance(world, GridMdp):
             raise InputError(f"mdp={world.name}: has no map; a batch of it is GridWorldVectorEnv(mdp=...)")
         if (world.thresholds != world.thresholds[0, 0]).any():

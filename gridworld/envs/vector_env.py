@@ -6,6 +6,7 @@ three look-ups in the same frozen tables that the single environment uses.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from os import PathLike
 from typing import Any, NamedTuple
 
@@ -87,6 +88,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         step_reward: float = 0.0,
         goal_reward: float = 1.0,
         trap_reward: float = -1.0,
+        rewards: Mapping[str, float] | None = None,
         cell_size: int = CELL_SIZE,
         mdp: Mdp | None = None,
         stratified: bool = False,
@@ -107,7 +109,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         )
         self.step_limit: int = self.max_episode_steps or np.iinfo(np.int64).max
         self._mdp = mdp_or_compiled(
-            mdp, layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward
+            mdp, layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward, rewards
         )
         self.render_mode = render_mode
         self.cell_size = positive_int("cell_size", cell_size)

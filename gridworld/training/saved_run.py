@@ -94,7 +94,7 @@ class SavedRun:
             if not isinstance(env, MapConfig) or not isinstance(mdp, GridMdp):
                 raise InputError(f"layout {layout!r}: {self.run.folder} was trained on {env.name}, not a map")
             rows, columns = mdp.layout.num_rows, mdp.layout.num_cols
-            world = load(layout, rows, columns) if layout == CLASSIC else load(layout)
+            world = load(layout, rows, columns) if layout == CLASSIC else load(layout, rewards=env.rewards)
             if (world.num_rows, world.num_cols) != (rows, columns):
                 raise InputError(
                     f"layout {world.name}: is {world.num_rows}x{world.num_cols}, the agent was trained on "

@@ -2,13 +2,14 @@
 
 A move succeeds with probability 1 - slip; otherwise one of the two perpendicular moves happens instead, with
 probability slip / 2 each. A move off the grid or into a wall leaves the agent where it is. The reward of a
-step is `step_reward` plus the reward of the cell entered (goal, trap, or nothing). A move into a cliff pays
-as one into a trap and leads to the start, so that no agent is ever on a cliff cell. Walls absorb as terminal
-cells do.
+step is `step_reward` plus the reward of the cell entered (goal, trap, an end's own, or nothing). A move into
+a cliff pays as one into a trap and leads to the start, so that no agent is ever on a cliff cell. Walls absorb
+as terminal cells do.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -100,7 +101,11 @@ def compile_mdp(
     chances = [1.0] if slip == 0 else [1 - slip, slip / 2, slip / 2]
     thresholds = [] if slip == 0 else [1 - slip, 1 - slip / 2]
     next_state = np.stack(outcomes, axis=-1)
-    reward = (step_reward + goal_reward * goal + trap_reward * (trap | cliff))[next_state]
+    entered = step_reward + goal_reward * goal + trap_reward * (trap | cliff)
+    for end in layout.ends:
+        pays = checked_reward(f"{layout.name}: reward of {end.letter}", end.reward)
+        entered[_mask(layout, end.cells)] = step_reward + pays
+    reward = entered[next_state]
     next_state[cliff[next_state]] = layout.state(layout.starts[0])  # the only one where there is a cliff
     next_state[absorbing] = np.flatnonzero(absorbing).reshape(-1, 1, 1)
     reward[absorbing] = 0.0
@@ -137,6 +142,7 @@ def mdp_or_compiled(
     step_reward: float,
     goal_reward: float,
     trap_reward: float,
+    rewards: Mapping[str, float] | None = None,
 ) -> Mdp:
     """The world of an environment's arguments: `mdp`, or else the one that the others describe.
 
@@ -145,11 +151,11 @@ def mdp_or_compiled(
     described = (layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward)
     if mdp is None:
         rows, cols = positive_int("num_rows", num_rows), positive_int("num_cols", num_cols)
-        given = load(layout, None if rows == NUM_ROWS else rows, None if cols == NUM_COLS else cols)
+        given = load(layout, None if rows == NUM_ROWS else rows, None if cols == NUM_COLS else cols, rewards)
         return compile_mdp(given, slip, step_reward, goal_reward, trap_reward)
     if not isinstance(mdp, Mdp):
         raise InputError(f"mdp={str(mdp)[:50]}: must be a compiled world, as from `compile_mdp`")
-    if described != (CLASSIC, NUM_ROWS, NUM_COLS, 0.0, 0.0, 1.0, -1.0):
+    if described != (CLASSIC, NUM_ROWS, NUM_COLS, 0.0, 0.0, 1.0, -1.0) or rewards:
         raise InputError(f"mdp={mdp.name}: has its own layout, slip and rewards; leave these arguments out")
     return mdp
 

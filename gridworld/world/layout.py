@@ -4,10 +4,13 @@ Maps are text, one line a row and one sign a cell:
 
     S  start (several: each episode draws one of them, uniformly)
     G  goal, ends the episode
-    T  trap, ends the episode
+    T  trap, ends the episode; also H
     C  cliff: who steps here pays as for a trap, is back at the start at once, and the episode goes on
     #  wall, cannot be entered
-    .  floor
+    .  floor; also F
+
+Any other capital letter is an end with a reward of its own, which a line above the map gives, as `A=10 B=-1`.
+Those that pay more than 0 are goals, the others traps; in a map where nothing else is a goal, the best are.
 
 `Layout` is the checked, immutable form: there is a start and a goal, no cell is two things, every start can
 reach a goal without stepping on a trap or a cliff, and where there is a cliff, there is one start to be sent
@@ -16,11 +19,13 @@ back to.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
 from os import PathLike, fspath
+from typing import Any, NamedTuple
 
 from gridworld.base.bounds import positive_int
 from gridworld.base.errors import InputError
@@ -34,7 +39,15 @@ MOVES: tuple[Cell, ...] = ((-1, 0), (0, 1), (1, 0), (0, -1))  # up, right, down,
 CLASSIC = "classic"
 NUM_ROWS, NUM_COLS = 5, 6  # of classic
 LEAST_ROWS, LEAST_COLS = 4, 3
-_TILES = "SGTC#."
+_TILES = {**{tile: tile for tile in "SGTC#."}, "H": "T", "F": "."}
+
+
+class End(NamedTuple):
+    """The ends of one letter, with a reward of their own; each is among the goals or the traps."""
+
+    letter: str
+    reward: float
+    cells: tuple[Cell, ...]
 
 
 @dataclass(frozen=True)
@@ -52,6 +65,7 @@ class Layout:
     traps: tuple[Cell, ...] = ()
     walls: frozenset[Cell] = frozenset()
     cliffs: tuple[Cell, ...] = ()
+    ends: tuple[End, ...] = ()
 
     def __post_init__(self) -> None:
         _check(self)
@@ -70,13 +84,20 @@ class Layout:
         return cell[0] * self.num_cols + cell[1]
 
     def text(self) -> str:
-        """The map as text, one line a row, no newline at the end; `parse` reads it back."""
+        """The map as text, one line a row, no newline at the end; `parse` reads it back.
+
+        Rewards of ends are in a line above it.
+        """
         grid = [["."] * self.num_cols for _ in range(self.num_rows)]
         kinds = (self.starts, self.goals, self.traps, self.cliffs, self.walls)
         for tile, cells in zip("SGTC#", kinds, strict=True):
             for row, col in cells:
                 grid[row][col] = tile
-        return "\n".join(map("".join, grid))
+        for end in self.ends:
+            for row, col in end.cells:
+                grid[row][col] = end.letter
+        heading = [" ".join(f"{end.letter}={end.reward!r}".removesuffix(".0") for end in self.ends)]
+        return "\n".join([*heading[: len(self.ends)], *map("".join, grid)])
 
 
 def classic(num_rows: int = NUM_ROWS, num_cols: int = NUM_COLS) -> Layout:
@@ -95,34 +116,73 @@ def classic(num_rows: int = NUM_ROWS, num_cols: int = NUM_COLS) -> Layout:
     return Layout(CLASSIC, num_rows, num_cols, starts=((0, 0),), goals=((row, col),), traps=traps)
 
 
-def parse(text: str, name: str) -> Layout:
-    """Read a map from its text: one line a row and one sign a cell; `name` is what messages call it."""
+def parse(text: str, name: str, rewards: Mapping[str, float] | None = None) -> Layout:
+    """Read a map from its text: one line a row and one sign a cell; `name` is what messages call it.
+
+    `rewards` are of ends by their letters, in place of those in the text.
+    """
     lines = [line.rstrip() for line in text.replace("\r\n", "\n").replace("\r", "\n").split("\n")]
     while lines and not lines[-1]:
         lines.pop()
     if not lines:
         raise InputError(f"{name}: the map is empty; it needs at least a start 'S' and a goal 'G'")
+    paid = _paid(name, lines.pop(0) if "=" in lines[0] else "", rewards or {})
+    if not lines:
+        raise InputError(f"{name}: there is no map below the rewards of its ends")
     _check_size(name, len(lines), len(lines[0]))
-    found: dict[str, list[Cell]] = {tile: [] for tile in _TILES}
+    found: dict[str, list[Cell]] = {tile: [] for tile in [*_TILES, *paid]}
     for row, line in enumerate(lines):
         for col, tile in enumerate(line):
             if tile not in found:
                 raise InputError(
                     f"{name}: row {row + 1}, column {col + 1}: unknown tile {tile!r}; use S (start), G "
-                    "(goal), T (trap), C (cliff), # (wall) and . (floor)"
+                    "(goal), T or H (trap), C (cliff), # (wall) and . or F (floor), or give the reward of "
+                    "an end in the first line, as A=10"
                 )
-            found[tile].append((row, col))
+            found[_TILES.get(tile, tile)].append((row, col))
         if len(line) != len(lines[0]):
             raise InputError(
                 f"{name}: row {row + 1} has {len(line)} columns, row 1 has {len(lines[0])}; all rows must "
                 "have equal lengths"
             )
+    ends = tuple(End(letter, paid[letter], tuple(found[letter])) for letter in sorted(paid))
+    best = 0.0 if found["G"] else max((end.reward for end in ends), default=0.0)
+    is_best = [end.reward > 0 or (not found["G"] and end.reward == best) for end in ends]
+    for end, is_goal in zip(ends, is_best, strict=True):
+        found["G" if is_goal else "T"] += end.cells
     starts, goals, traps, cliffs = (tuple(found[tile]) for tile in "SGTC")
-    return Layout(name, len(lines), len(lines[0]), starts, goals, traps, frozenset(found["#"]), cliffs)
+    return Layout(name, len(lines), len(lines[0]), starts, goals, traps, frozenset(found["#"]), cliffs, ends)
+
+
+def _paid(name: str, heading: str, rewards: Mapping[str, float]) -> dict[str, float]:
+    """The reward of each end by its letter, from the line above a map and the rewards in place of its."""
+    from gridworld.world.mdp import checked_reward  # here, with numpy, which `--help` does not need
+
+    if not isinstance(rewards, Mapping):
+        raise InputError(
+            f"rewards={str(rewards)[:50]}: must be a mapping of letters to rewards, as {{A: 10}}"
+        )
+    paid: dict[str, Any] = {}
+    for word in heading.split():
+        letter, _, number = word.partition("=")
+        try:
+            paid[letter] = float(number)
+        except ValueError:
+            raise InputError(
+                f"{name}: first line: {word[:50]!r} is not the reward of an end; must be as A=10"
+            ) from None
+    for letter in (paid := paid | dict(rewards)):
+        if not re.fullmatch("[A-Z]", str(letter)) or letter in _TILES:
+            known = ", ".join(filter(str.isalpha, _TILES))
+            raise InputError(f"{name}: {str(letter)[:20]!r} cannot be an end; use A to Z, but not {known}")
+    return {letter: checked_reward(f"{name}: reward of {letter}", each) for letter, each in paid.items()}
 
 
 def load(
-    layout: str | PathLike[str] | Layout, num_rows: int | None = None, num_cols: int | None = None
+    layout: str | PathLike[str] | Layout,
+    num_rows: int | None = None,
+    num_cols: int | None = None,
+    rewards: Mapping[str, float] | None = None,
 ) -> Layout:
     """Get a layout.
 
@@ -130,13 +190,18 @@ def load(
         layout: `classic`, the name of a shipped map, the path of a map file, or a layout.
         num_rows: sizes `classic`. A map has its own size; where one is given, it must agree.
         num_cols: the same.
+        rewards: of ends by their letters, in place of the map's own.
 
     Raises:
         InputError: no such map, or one that could not be played.
     """
     if isinstance(layout, str) and layout == CLASSIC:
-        return classic(NUM_ROWS if num_rows is None else num_rows, NUM_COLS if num_cols is None else num_cols)
-    loaded = layout if isinstance(layout, Layout) else _read(layout)
+        rows, cols = NUM_ROWS if num_rows is None else num_rows, NUM_COLS if num_cols is None else num_cols
+        layout = classic(rows, cols)
+    if not isinstance(layout, Layout):
+        loaded = _read(layout, rewards)
+    else:
+        loaded = parse(layout.text(), layout.name, rewards) if rewards else layout
     for what, asked in (("num_rows", num_rows), ("num_cols", num_cols)):
         actual = getattr(loaded, what)
         if asked is not None and positive_int(what, asked) != actual:
@@ -153,12 +218,13 @@ def shipped_layouts() -> tuple[str, ...]:
     return tuple(sorted([CLASSIC, *(name.removesuffix(".txt") for name in maps if name.endswith(".txt"))]))
 
 
-def _read(layout: str | PathLike[str]) -> Layout:
+def _read(layout: str | PathLike[str], rewards: Mapping[str, float] | None) -> Layout:
     given = fspath(layout) if isinstance(layout, str | PathLike) else None
     if not isinstance(given, str) or not given:
         raise InputError(f"layout={layout!r}: must be a layout's name, a map file's path or a Layout")
     if given in shipped_layouts():
-        return parse(files("gridworld").joinpath("layouts", f"{given}.txt").read_text("utf-8"), name=given)
+        text = files("gridworld").joinpath("layouts", f"{given}.txt").read_text("utf-8")
+        return parse(text, given, rewards)
     try:
         # A row may end in blanks or \r\n; far more than that is not a map, and is not read.
         with open_users_file(given) as file:
@@ -167,7 +233,7 @@ def _read(layout: str | PathLike[str]) -> Layout:
             raise InputError(f"layout {given!r}: is not an ordinary file; give a readable text file")
         if len(raw) > 4 * MAX_CELLS:
             raise InputError(f"{given}: the map is too large; at most {MAX_CELLS} cells are allowed")
-        return parse(raw.decode("utf-8-sig"), name=given)
+        return parse(raw.decode("utf-8-sig"), given, rewards)
     except UnicodeDecodeError as error:
         raise InputError(f"{given}: not a text file (byte {error.start + 1} is not UTF-8)") from None
     except InputError:
@@ -207,6 +273,9 @@ def _check(layout: Layout) -> None:
             if (row, col) in kind:
                 raise refused(f"{where}: a {what} on a {kind[row, col]}", "a cell can be one thing only")
             kind[row, col] = what
+    for letter, _, cells in layout.ends:
+        if not cells or not set(cells) <= set(layout.terminals):
+            raise refused(f"the end {letter!r} is not on the map", "mark its cells or leave out its reward")
     if layout.cliffs and len(layout.starts) > 1:
         raise refused(
             f"a cliff 'C' leads back to the start, but there are {len(layout.starts)}", "keep one 'S'"

@@ -26,7 +26,7 @@ DECLARED = {
     Effect.MACHINE: {"device", "threads"},
     Effect.TASK: {
         *("env.layout", "env.num_rows", "env.num_cols", "env.slip", "env.max_episode_steps"),
-        *("env.step_reward", "env.goal_reward", "env.trap_reward", "evaluation.gamma"),
+        *("env.step_reward", "env.goal_reward", "env.trap_reward", "env.rewards", "evaluation.gamma"),
     },
     Effect.EVALUATION: {"evaluation.every", "evaluation.stop_after"},
     Effect.LABELS: {

@@ -17,6 +17,7 @@ from stable_baselines3 import DQN
 from gridworld.base.errors import InputError
 from gridworld.base.signals import Interrupted
 from gridworld.commands import evaluate, play, record
+from gridworld.report.playground.page import world_page
 from gridworld.training import session
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.saved_run import SavedRun
@@ -165,3 +166,23 @@ def test_a_bug_leaves_its_traceback(tmp_path: Path) -> None:
     script("train.py", "resume=run", "trust=true", "anyway=true", cwd=tmp_path, PYTHONPATH=str(tmp_path))
     assert not (tmp_path / "run" / "error.txt").exists()
     assert log(tmp_path / "run")[-1] == "INFO finished after 512 steps"
+
+
+def test_ends_of_a_map_stay_with_the_run(tmp_path: Path) -> None:
+    file, folder = tmp_path / "bridge.txt", tmp_path / "run"
+    file.write_text("A=10 B=-100\n#BBBBB#\nDS...FA\n#BBBBB#")
+    few = ["agent=q_learning", "total_timesteps=600", "n_envs=1", "evaluation.every=200", *NO_FILES]
+    begin(folder, *few, f"env.layout={file}", "env.rewards={D: 1, B: -50}")
+    file.unlink()
+    go_on(folder, 1200)
+    saved = SavedRun(folder)
+    assert saved.steps() == 1200
+    assert saved.mdp.text() == "A=10 B=-50 D=1\n#BBBBB#\nDS....A\n#BBBBB#"
+    assert saved.evaluator().solution.v[7:14].max() == pytest.approx(10)
+    other = tmp_path / "other.txt"
+    other.write_text("#BBBBB#\nA...S.D\n#BBBBB#")
+    with pytest.raises(InputError, match=r"other.txt: row 2, column 1: unknown tile 'A'"):
+        saved.evaluator(str(other))
+    other.write_text("A=2\n" + other.read_text())
+    assert saved.evaluator(str(other)).mdp.text().startswith("A=2 B=-50 D=1\n")
+    assert '"tables"' in world_page(saved.mdp, 0.99, 100)  # which a link has no room for

@@ -6,12 +6,14 @@ import os
 import pickle
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.oracle import World, maps
 from hypothesis import given
 
-from gridworld import GridWorldEnv, InputError, shipped_layouts
+from gridworld import GridWorldEnv, InputError, compile_mdp, make_vec_env, shipped_layouts
 from gridworld.world.layout import classic, load, parse
+from gridworld.world.solver import value_iteration
 
 SHIPPED = (
     *("aima_4x3", "classic", "cliff", "cliff_walking", "four_rooms"),
@@ -33,9 +35,103 @@ def test_every_tile_is_read_where_it_stands(rows):
     assert parse(layout.text(), "map") == layout
 
 
+@given(maps())
+def test_letters_of_frozen_lake_mean_the_same(rows):
+    text = "\n".join(rows)
+    for lake in (text.replace(".", "F").replace("T", "H"), text.replace(".", "F", 1).replace("T", "H", 1)):
+        layout = parse(lake, "map")
+        assert layout == parse(text, "map")
+        assert layout.text() == text
+
+
+# Berkeley's CS188, project 3: gridworld.py and the solutions of its autograder, test_cases/q1. There the exit
+# is a step of its own, so that its values are those of here, discounted once more.
+BRIDGE = "A=10 B=-100 D=1\n#BBBBB#\nDS....A\n#BBBBB#"
+
+
+def berkeley(text, gamma, slip):
+    solution = value_iteration(compile_mdp(parse(text, "map"), slip=slip), gamma)
+    return gamma * solution.v
+
+
+def test_the_bridge_of_berkeley():
+    found = berkeley(BRIDGE, 0.85, 0.1).reshape(3, 7)
+    assert found[1, 1:6] == pytest.approx([-7.7350, -14.4173, -15.4999, -9.1502, -0.8500], abs=5e-5)
+
+
+def test_the_discount_grid_of_berkeley():
+    """The autograder's grid is another one's transpose: its columns are rows here."""
+    rows = ["BBBBB", ".....", "A#D#.", "..." + "#.", "....."]
+    found = berkeley("A=10 B=-10 D=1\n" + "\n".join(rows).replace(".", "S", 1), 0.9, 0.2).reshape(5, 5)
+    assert found[1] == pytest.approx([8.4777, 5.7186, 3.3074, 2.0045, 2.9289], abs=5e-5)
+    assert found[3:, [0, 1, 2, 4]] == pytest.approx(
+        np.array([[8.6547, 7.5087, 6.0258, 3.9306], [7.5087, 6.6836, 5.8841, 4.4765]]), abs=5e-5
+    )
+    assert found[2, 4] == pytest.approx(3.4513, abs=5e-5)
+    assert found[4, 3] == pytest.approx(5.1665, abs=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("text", "goals", "traps"),
+    [
+        ("A=1 B=-1\nASB", "A", "B"),
+        ("A=1 B=10 D=0\nASB.D", "AB", "D"),
+        ("A=-1 B=-2 D=-1\nASB.D", "AD", "B"),
+        ("A=0 B=-2\nGSA.B", "G", "AB"),
+        ("A=3\nTSA.G", "GA", "T"),
+    ],
+)
+def test_which_ends_are_goals(text, goals, traps):
+    layout, row = parse(text, "map"), text.split("\n")[1]
+    assert sorted(layout.goals) == sorted((0, row.index(letter)) for letter in goals)
+    assert sorted(layout.traps) == sorted((0, row.index(letter)) for letter in traps)
+    mdp = compile_mdp(layout, step_reward=-0.5, goal_reward=7, trap_reward=-7)
+    paid = {"G": 7.0, "T": -7.0} | {end.letter: end.reward for end in layout.ends}
+    for col, letter in enumerate(row):
+        beside, action = (col - 1, 1) if col else (1, 3)
+        if letter in paid:
+            assert mdp.reward[beside, action, 0] == -0.5 + paid[letter]
+    assert layout.text() == text
+    assert parse(text, "map") == layout
+
+
+def test_rewards_are_given_or_replaced(tmp_path):
+    path = tmp_path / "ends.txt"
+    path.write_text("A=1\nASB")
+    changed = {"A": 2, "B": -0.125}
+    layout = load(path, rewards=changed)
+    assert layout.text() == "A=2 B=-0.125\nASB"
+    assert load(parse("A=1\nSA", "made"), rewards={"A": 3}).ends[0].reward == 3
+    for env in (GridWorldEnv(layout=path, rewards=changed), GridWorldEnv(layout=layout)):
+        assert env.mdp.reward[1, 3, 0] == 2
+        assert env.trap_cells == [(0, 2)]
+    assert make_vec_env(str(path), rewards=changed).envs.mdp.reward[1, 1, 0] == -0.125
+    for wrong, mistake in (
+        ({**changed, "D": 1}, "the end 'D' is not on the map; mark its cells or leave out its reward"),
+        ({**changed, "G": 1}, "'G' cannot be an end; use A to Z, but not S, G, T, C, H, F"),
+        ({**changed, "A": "x"}, "reward of A=x: must be a finite number"),
+        (3, "rewards=3: must be a mapping of letters to rewards"),
+    ):
+        with pytest.raises(InputError, match=mistake):
+            load(path, rewards=wrong)
+    with pytest.raises(InputError, match="the end 'A' is not on the map"):
+        load("classic", rewards={"A": 1})
+    with pytest.raises(InputError, match="has its own layout, slip and rewards"):
+        GridWorldEnv(mdp=compile_mdp(layout), rewards={"A": 1})
+
+
 @pytest.mark.parametrize(
     ("raw", "mistake"),
     [
+        (b"A=x\nSA\n", r"first line: 'A=x' is not the reward of an end; must be as A=10"),
+        (b"A=\nSA\n", r"first line: 'A=' is not the reward"),
+        (b"A=nan\nSA\n", r"reward of A=nan: must be a finite number"),
+        (b"A=1e200\nSA\n", r"reward of A=1e\+200: must be 0, or from"),
+        (b"a=1\nSa\n", r"'a' cannot be an end; use A to Z, but not S, G, T, C, H, F"),
+        (b"A=1 T=1\nSA\n", r"'T' cannot be an end"),
+        (b"A=1\n", r"there is no map below the rewards of its ends"),
+        (b"A=1\nSG\n", r"the end 'A' is not on the map"),
+        (b"SAG\n", r"row 1, column 2: unknown tile 'A'.* or give the reward of an end in the first line"),
         (b"S.x.\n...G\n", r"row 1, column 3: unknown tile 'x'"),
         (b"S.\t.\n...G\n", r"row 1, column 3: unknown tile '\\t'"),
         (b"S...\n....\n....G\n", r"row 3 has 5 columns, row 1 has 4"),

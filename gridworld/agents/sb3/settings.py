@@ -171,9 +171,11 @@ class SB3Config(AgentConfig):
                     f"callbacks[{index}]={entry}: must be a mapping of _target_, the import path of a "
                     "callback's class, and its arguments"
                 )
+        ends = {f"rewards.{letter}": pay for letter, pay in getattr(run.env, "rewards", {}).items()}
         steps = {"step_reward": run.env.max_episode_steps or 1, "goal_reward": 1, "trap_reward": 1}
+        steps |= dict.fromkeys(ends, 1)
         for name, times in steps.items():  # an episode's return and its square must be numbers of 32 bits
-            most, reward = _MOST_RETURN / times, vars(run.env).get(name, 0.0)
+            most, reward = _MOST_RETURN / times, (vars(run.env) | ends).get(name, 0.0)
             Bounds(-most, most, least=_LEAST_REWARD).check(f"env.{name}", reward)
         key, value = self.key("train_freq"), self.given.get("train_freq", 1)
         count, unit = value if isinstance(value, list | tuple) and len(value) == 2 else (value, "step")

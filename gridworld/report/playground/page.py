@@ -11,7 +11,7 @@ import math
 import re
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import yaml
@@ -96,6 +96,11 @@ def run_page(saved: SavedRun) -> str:
     return _page(data)
 
 
+def has_link(mdp: Mdp) -> TypeGuard[GridMdp]:
+    """Whether a link can hold the world: a map without rewards of its own."""
+    return isinstance(mdp, GridMdp) and not mdp.layout.ends
+
+
 def link(mdp: GridMdp, gamma: float, step_limit: int) -> str:
     """What follows `#` in the page's address for the world of a map; `readLink` in world.js reads it."""
     settings = {key: getattr(mdp, key) for key in _SETTINGS}
@@ -118,7 +123,7 @@ def _world(mdp: Mdp, gamma: float, step_limit: int) -> dict[str, Any]:
             f"maps of at most {_MOST_SIDE} rows and columns, with {_MOST_OUTCOMES:,} outcomes of all actions"
         )
     data: dict[str, Any] = {"shipped": shipped(), "title": _name(mdp.name), "gamma": gamma}
-    if isinstance(mdp, GridMdp):
+    if has_link(mdp):
         return data | {"link": link(mdp, gamma, step_limit)}
     arrays = {
         "next": mdp.next_state,

@@ -42,6 +42,7 @@ export function parse(text) {
   if (rows > MOST_SIDE || cols > MOST_SIDE || rows * cols > MOST_CELLS)
     refuse(`${rows} rows of ${cols} columns are too large; at most ${MOST_CELLS} cells fit, ${MOST_SIDE} in a row`);
   lines.forEach((line, row) => {
+    lines[row] = line = line.replaceAll("H", "T").replaceAll("F", "."); // as FrozenLake has them
     const strange = line.search(/[^SGTC#.]/);
     if (strange >= 0)
       refuse(`row ${row + 1}, column ${strange + 1}: unknown tile; use S (start), G (goal), T (trap), C (cliff), ` +

@@ -19,7 +19,8 @@ In a deterministic world, the tables may be (N, A), and `probability` may be lef
     numpy.savez("two_rooms.npz", next_state=[[0, 1], [0, 1]], reward=[[0.0, 0.0], [0.0, 1.0]],
                 terminated=[[False, False], [False, True]], start=[1.0, 0.0])
 
-A run's world holds the fields of an `Mdp` as they are.
+A run's world holds the fields of an `Mdp` as they are. What other programs write, matrices `P` and `R`, .mat,
+.MDP and .POMDP, is in `gridworld.world.sources.files` and `gridworld.world.sources.cassandra`.
 """
 
 from __future__ import annotations
@@ -49,48 +50,64 @@ from gridworld.world.outcomes import (
     verified,
 )
 from gridworld.world.shown import space_of_text, space_text
+from gridworld.world.sources.cassandra import world_of_text
+from gridworld.world.sources.files import dense, mat_arrays, outcomes_of_matrices
 from gridworld.world.sources.gymnasium_table import mdp_of_table
 
 _TABLES = ("next_state", "probability", "reward", "terminated", "success")
 _NEEDED = ("next_state", "reward", "terminated", "start")
+_MATRICES = ("P", "R")
 _OPTIONAL = ("probability", "success", "action_names", "places", "max_episode_steps", "name")
 _LISTS = ("panel_names", "state_names")  # of names, which most worlds do not have
 _OWN = "own_observation"
 _MOST_BYTES = 4 * 2**30
+_MOST_TEXT = 64 * 2**20
+_TEXTS = (".mdp", ".pomdp")
+_FILES = "an .npz, .mat, .MDP or .POMDP file"
 _FORMAT = np.array("gridworld world 1")
 
 
 def load_world(path: str | PathLike[str]) -> Mdp:
-    """Read a world from an .npz file, a custom one or a run's `world.npz`; the module says what is in them.
+    """Read a world from a file: an .npz, a custom one or a run's `world.npz`, a .mat, an .MDP or a .POMDP.
 
-    Without a `name` in it, the world is named after the file. Raises InputError if it is no such file.
+    The module says what is in them. Without a `name` in it, the world is named after the file. Raises
+    InputError if it is no such file.
     """
-    arrays = npz_arrays(path, _read(path), "an .npz file of arrays", _MOST_BYTES)
+    content, where = _read(path), Path(path)
+    if (ending := where.suffix.lower()) in _TEXTS:
+        return world_of_text(where.stem, content, str(path))
+    if ending == ".mat":
+        return mdp_from_arrays(where.stem, mat_arrays(content, str(path)), str(path))
+    arrays = npz_arrays(path, content, "an .npz file of arrays", _MOST_BYTES)
     if "format" in arrays:
         return _from_fields(arrays, str(path))
-    return mdp_from_arrays(Path(path).stem, arrays, str(path))
+    return mdp_from_arrays(where.stem, arrays, str(path))
 
 
 def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
     """Compile the arrays of a custom world, or what numpy makes arrays of, by name; see the module."""
-    for key in _NEEDED:
+    is_matrices = any(key in arrays for key in _MATRICES)
+    needed = _MATRICES if is_matrices else _NEEDED
+    optional = ("start", *_OPTIONAL[2:]) if is_matrices else _OPTIONAL
+    for key in needed:
         if key not in arrays:
-            raise InputError(f"{where}: has no {key}, must contain {', '.join(_NEEDED)}")
-    if unknown := [key for key in arrays if key not in _NEEDED + _OPTIONAL]:
+            raise InputError(f"{where}: has no {key}, must contain {', '.join(needed)}")
+    if unknown := [key for key in arrays if key not in needed + optional]:
         raise InputError(
-            f"{where}: {str(unknown[0])[:50]} is not an array of a world; optional are {', '.join(_OPTIONAL)}"
+            f"{where}: {str(unknown[0])[:50]} is not an array of a world; optional are {', '.join(optional)}"
         )
-    given = {key: _array(where, key, value) for key, value in arrays.items()}
-    if given["next_state"].ndim == 2:
-        flat = [key for key in _TABLES if key in given and given[key].ndim == 2]
-        given |= {key: given[key][:, :, None] for key in flat}
-        given.setdefault("probability", np.ones(given["next_state"].shape))
-    elif "probability" not in given:
-        raise InputError(f"{where}: has no probability; without it, next_state must be (states, actions)")
+    given = {
+        key: _array(where, key, dense(where, key, value) if key in _MATRICES else value)
+        for key, value in arrays.items()
+    }
+    tables = (
+        outcomes_of_matrices(where, given["P"], given["R"], given.get("start"))
+        if is_matrices
+        else _outcomes(where, given)
+    )
     places = given.get("places")
     if places is not None and places.ndim == 2 and places.shape[1] == 2 and places.dtype.kind in "iu":
         places = np.concatenate([np.where(places[:, :1] < 0, -1, 0), places], axis=1)  # of one panel
-    tables = Outcomes(**{key: given[key] for key in (*_TABLES, "start") if key in given})
     mdp = mdp_from_outcomes(
         where,
         tables,
@@ -100,6 +117,17 @@ def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
     )
     called = checked_text(where, "name", given["name"]) if "name" in given else name
     return verified(dataclasses.replace(mdp, name=called), where)
+
+
+def _outcomes(where: str, given: dict[str, NDArray[Any]]) -> Outcomes:
+    """The tables among the arrays of a custom world."""
+    if given["next_state"].ndim == 2:
+        flat = [key for key in _TABLES if key in given and given[key].ndim == 2]
+        given |= {key: given[key][:, :, None] for key in flat}
+        given.setdefault("probability", np.ones(given["next_state"].shape))
+    elif "probability" not in given:
+        raise InputError(f"{where}: has no probability; without it, next_state must be (states, actions)")
+    return Outcomes(**{key: given[key] for key in (*_TABLES, "start") if key in given})
 
 
 def build(builder: str | Callable[..., Any], kwargs: Mapping[str, Any] | None = None) -> Mdp:
@@ -184,15 +212,16 @@ def _whole(where: str, key: str, given: NDArray[Any] | None) -> int | None:
 def _read(path: str | PathLike[str]) -> bytes:
     given = fspath(path) if isinstance(path, str | PathLike) else None
     if not isinstance(given, str) or not given:
-        raise InputError(f"env.path={path!r}: must be the path of an .npz file")
+        raise InputError(f"env.path={path!r}: must be the path of {_FILES}")
     try:
         with open_users_file(given) as file:
             if file is None:
-                raise InputError(f"env.path={given}: is not an ordinary file; give an .npz file")
+                raise InputError(f"env.path={given}: is not an ordinary file; give {_FILES}")
             size = os.fstat(file.fileno()).st_size
-            if size > _MOST_BYTES:
+            most = _MOST_TEXT if given.lower().endswith(_TEXTS) else _MOST_BYTES
+            if size > most:
                 raise InputError(
-                    f"env.path={given}: is larger than {_MOST_BYTES / 2**30:.0f} GiB; give a smaller world"
+                    f"env.path={given}: is larger than {most / 2**20:,.0f} MiB; give a smaller world"
                 )
             check_memory(given, 2 * size)
             _check_shapes(f"env.path={given}", file)
@@ -201,10 +230,10 @@ def _read(path: str | PathLike[str]) -> bytes:
     except InputError:
         raise
     except IsADirectoryError:
-        raise InputError(f"env.path={given}: is a folder; give an .npz file") from None
+        raise InputError(f"env.path={given}: is a folder; give {_FILES}") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", error)
-        raise InputError(f"env.path={given}: cannot be read ({reason}); give an .npz file") from None
+        raise InputError(f"env.path={given}: cannot be read ({reason}); give {_FILES}") from None
 
 
 def _check_shapes(where: str, file: BinaryIO) -> None:
@@ -218,7 +247,9 @@ def _check_shapes(where: str, file: BinaryIO) -> None:
                     read = form.read_array_header_1_0 if is_first else form.read_array_header_2_0
                     shape, _, _ = read(member)
                     name = info.filename.removesuffix(".npy")
-                    if name in _TABLES and len(shape) > 1:
+                    if name in _MATRICES and len(shape) == 3:
+                        check_size(where, shape[1], shape[0], shape[2])
+                    elif name in _TABLES and len(shape) > 1:
                         check_size(where, shape[0], shape[1], math.prod(shape[2:]))
                     elif math.prod(shape[:1]) > MOST_STATES:
                         raise InputError(f"{where}: {name} has {shape[0]:,} entries, too many for a world")

@@ -205,7 +205,7 @@ def test_no_file_of_arrays(tmp_path, monkeypatch):
     monkeypatch.setattr("gridworld.world.sources.arrays._MOST_BYTES", 2**20)
     for path, told in (
         (tmp_path / "none.npz", "env.path=.*none.npz: cannot be read .No such file"),
-        (tmp_path, "env.path=.*: is a folder; give an .npz file"),
+        (tmp_path, "env.path=.*: is a folder; give an .npz, .mat, .MDP or .POMDP file"),
         (3, "env.path=3: must be the path"),
         (tmp_path / "text.npz", "text.npz: not an .npz file of arrays that can be read"),
         (tmp_path / "one.npy", "not an .npz file of arrays"),
