@@ -84,8 +84,8 @@ class Mdp:
     @property
     def scope(self) -> str:
         """How the tables are known, which a verdict about them says."""
-        if self.truth == EXACT:
-            return BY_CONSTRUCTION
+        if self.truth.startswith(EXACT):
+            return self.truth.replace(EXACT, BY_CONSTRUCTION, 1)
         here = "" if ELSEWHERE in self.truth else ", in this process"
         if not self.is_enumerated:
             return f"by its {self.truth}{here}"
