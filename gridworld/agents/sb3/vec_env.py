@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 from gridworld.base.errors import InputError
 from gridworld.base.serialization import independent_generator
 from gridworld.config.compose import named_world
+from gridworld.envs.inspection import world_of
 from gridworld.envs.observations import IMAGE_CELL_SIZE, ObservationTable, make_observation
 from gridworld.envs.vector_env import GridWorldVectorEnv, StateArray
 from gridworld.world.layout import CLASSIC, Layout
@@ -114,7 +115,7 @@ class GridWorldVecEnv(VecEnv):
 
 
 def make_vec_env(
-    env: str | Mdp | Layout | PathLike[str] | None = None,
+    env: Any = None,
     n_envs: int = 64,
     observation: str = "one_hot",
     seed: int | None = 0,
@@ -125,8 +126,8 @@ def make_vec_env(
 
     Args:
         env: what `env=NAME` means on a command line (`classic`, `cliff`, `taxi_v4`, ...) or an id of
-            Gymnasium; a compiled world; or a map, its file or a `Layout`. `layout=NAME` is the bare map.
-            None: `classic`.
+            Gymnasium; a compiled world; a map, its file or a `Layout` (`layout=NAME` is the bare map); or an
+            environment, a class or a function that makes one, which is compiled. None: `classic`.
         n_envs: how many environments step together.
         observation: `one_hot`, `coordinates`, `image` (for CnnPolicy), `own` or `none` (the state's number).
         seed: of the starts and slips, unless the model has a seed, which SB3 gives to its environments; None:
@@ -154,8 +155,10 @@ def make_vec_env(
         if isinstance(env, str):
             settings = {name: world.pop(name) for name in set(world) - _OF_A_BATCH}
             world["mdp"] = named_world(env, **settings)
+        elif isinstance(env, Layout | PathLike):
+            world["layout"] = env
         else:
-            world["mdp" if isinstance(env, Mdp) else "layout"] = env
+            world["mdp"] = env if isinstance(env, Mdp) else world_of(env)
     if isinstance(mdp := world.get("mdp"), Mdp):
         world.setdefault("max_episode_steps", mdp.default_step_limit)
     envs = GridWorldVectorEnv(n_envs, autoreset_mode=AutoresetMode.SAME_STEP, **world)

@@ -77,6 +77,9 @@ class Node:
     rows: list[list[Step]] = field(default_factory=list)  # by actions; empty where none was tried
 
 
+_OFTEN = 100  # of so many nodes one shows how far it is
+
+
 class Beliefs:
     """All beliefs that histories from the start lead to, breadth first.
 
@@ -86,6 +89,7 @@ class Beliefs:
         refusal: makes an error of a reason.
         most: more nodes are refused.
         most_seconds: the time after which it is given up.
+        show: shows how far it is.
     """
 
     def __init__(
@@ -95,6 +99,7 @@ class Beliefs:
         refusal: Callable[[str], InputError],
         most: int,
         most_seconds: float = math.inf,
+        show: Callable[[str], None] = lambda what: None,
     ) -> None:
         self._refusal, self._most, self._num_parts = refusal, most, 0
         self._until = time.monotonic() + most_seconds
@@ -104,7 +109,9 @@ class Beliefs:
         for probability, hidden, seen in starts:
             first.setdefault(seen, []).append((hidden, probability))
         self.starts = [self._node(parts, seen) for seen, parts in first.items()]  # probability and node
-        for node in self.nodes:  # which grows
+        for number, node in enumerate(self.nodes):  # which grows
+            if not number % _OFTEN:
+                show(f"{len(self.nodes):,} distributions over its states")
             held = [(steps[number], probability) for number, probability in node.belief]
             if all(each for each, _ in held):
                 node.rows = [

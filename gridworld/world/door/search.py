@@ -22,7 +22,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from gridworld.base.console import telling_if_slow
+from gridworld.base.console import ProgressLine
 from gridworld.base.errors import GYMNASIUM, InputError, in_short, on_a_line
 from gridworld.base.user_input import check_memory
 from gridworld.world.door import known
@@ -43,6 +43,7 @@ _WALKS, _WALK = 20, 10  # walks that show which large attributes change, and the
 _FACING = ("right", "down", "left", "up")  # minigrid's directions
 _MOST_RESETS = 1_000  # that lead to other states than usual; more will not turn out to be alike
 _FEW_STARTS = 256  # of more, every outcome of a reset is tried from the first and the last state only
+_BETWEEN_LOOKS, _BETWEEN_LINES, _SLOW = 0.5, 3.0, 6.0  # seconds: of progress on a terminal, and elsewhere
 _LONGEST_NAME = 60  # of a state that is called by its observation
 _NOT_REPEATED = (
     "it does not repeat a walk with the same random numbers, so it depends on more than its attributes and "
@@ -114,6 +115,8 @@ class Search:
         self._num_bytes = 0
         self.limit_met: int | None = None  # the time at which it cuts episodes, where the time is no state
         self._began = time.monotonic()
+        self._line, self._due = ProgressLine(enabled=True, seconds_between_lines=_BETWEEN_LINES), 1.0
+        self._growing = ""
 
     def refusal(self, reason: str) -> InputError:
         """An error that says why there is no table of it."""
@@ -125,15 +128,30 @@ class Search:
 
     def seconds_left(self) -> float:
         """Of those that it may take."""
-        return self._most_seconds - (time.monotonic() - self._began)
+        return self._most_seconds - self._seconds()
+
+    def _seconds(self) -> float:
+        return time.monotonic() - self._began
+
+    def show(self, what: str) -> None:
+        """Show how far it is, from the first second on, and later what keeps growing, too."""
+        seconds = self._seconds()
+        if seconds >= self._due:
+            self._due = seconds + _BETWEEN_LOOKS
+            if seconds > _SLOW and not self._growing:
+                self._growing = f"; {self._most_values()} keeps changing"
+            self._line.show(lambda: f"{self.where}: {what}, {seconds:.0f} s{self._growing}; Ctrl-C ends it")
+
+    def clear(self) -> None:
+        """Remove that line from a terminal."""
+        self._line.clear()
 
     def explore(self) -> None:
         """Find all states that can be reached, and what every action does there."""
-        with telling_if_slow(f"trying all actions of {self.where}"):
-            try:
-                self._explored(counts_time=False)
-            except (_Missing, Timed):  # something reads what is around it: a time limit's count, say
-                self._explored(counts_time=True)
+        try:
+            self._explored(counts_time=False)
+        except (_Missing, Timed):  # something reads what is around it: a time limit's count, say
+            self._explored(counts_time=True)
 
     def _explored(self, counts_time: bool) -> None:
         runs = (Search.reset_from.__code__, Search.stepped_from.__code__)
@@ -224,6 +242,7 @@ class Search:
         beyond: int | None = None  # where in `waiting` the limit is, with `size` states before it
         size = 0
         for place, state in enumerate(waiting):  # which grows
+            self.show(f"{len(self.states):,} states, {place:,} of them tried")
             if beyond is None and state.depth >= (limit or _DEEPEST):
                 if limit is None:
                     still = f"after {_DEEPEST:,} steps it still finds new states"
@@ -491,18 +510,25 @@ class Search:
 
     # ---- what is said of it ----
 
-    def _what_changes(self) -> str:
-        """What has most values, the elapsed time among them, and a remedy, as the rest of a sentence."""
+    def _most_values(self) -> str:
+        """The attributes with the most values, the elapsed time among them."""
         values: dict[str, set[bytes]] = {}
         for copy in [each.copy for each in self.states[::_SAMPLED] if each.copy][-1000:]:
             self.layers.put(copy)
             for (_, name), key in self.layers.values(self.ignore).items():
                 values.setdefault(name, set()).add(key)
-        most = max(map(len, values.values()))
-        names = _listed(name for name, found in values.items() if len(found) == most)
+        most = max(map(len, values.values()), default=0)
+        return _listed(name for name, found in values.items() if len(found) == most)
+
+    def _what_changes(self) -> str:
+        """What keeps changing, and a remedy, as the rest of a sentence."""
+        names = self._most_values()
+        first, by_settings = names.split(",")[0], self.where.startswith("env.id")
+        limit = "env.kwargs.max_episode_steps" if by_settings else "gymnasium.wrappers.TimeLimit"
+        ignored = f"env.ignore=[{first}]" if by_settings else f'ignore=["{first}"]'
         return (
-            f"{names} keeps changing; use a smaller one, set a limit (env.kwargs.max_episode_steps), or "
-            f"ignore irrelevant attributes, e.g. env.ignore=[{names.split(',')[0]}]"
+            f"{names} keeps changing; use a smaller one, set a limit ({limit}), or ignore irrelevant "
+            f"attributes, e.g. {ignored}"
         )
 
 

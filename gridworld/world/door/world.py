@@ -76,8 +76,11 @@ def enumerated(
         InputError: it has no such world, or none within these bounds.
     """
     search = Search(where, env, ignore, state, most_states, most_seconds, compares)
-    search.explore()
-    return _World(search, name or type(env.unwrapped).__name__, by_word=state is not None).found
+    try:
+        search.explore()
+        return _World(search, name or type(env.unwrapped).__name__, by_word=state is not None).found
+    finally:
+        search.clear()
 
 
 class _World:
@@ -97,7 +100,7 @@ class _World:
         ]
         starts = [(each.probability, classes[each.following], each.seen) for each in search.starts]
         self.beliefs = beliefs = Beliefs(
-            starts, [*first, []], search.refusal, MOST_STATES, search.seconds_left()
+            starts, [*first, []], search.refusal, MOST_STATES, search.seconds_left(), search.show
         )
         space, numbers, size = search.env.observation_space, *self._numbers()
         named: list[Named] = [self._unreached(number) for number in range(size)]
