@@ -19,7 +19,7 @@ from gridworld.config.worlds import is_id
 from gridworld.envs.inspection import Task, task_of, world_of
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.world.chain import as_numbers, policy_of_table
-from gridworld.world.door.search import MOST_SECONDS, MOST_STATES
+from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES
 from gridworld.world.evaluation import Evaluator, PolicySnapshot, Score
 from gridworld.world.grid import GridMdp
 from gridworld.world.grid import compile_mdp as compiled_map

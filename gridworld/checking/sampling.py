@@ -21,7 +21,8 @@ import numpy as np
 from gymnasium import spaces
 
 from gridworld.base.errors import in_short
-from gridworld.world.door.layers import GENERATORS, contents, random_states, state_of
+from gridworld.world.door.attributes import GENERATORS, random_states, state_of
+from gridworld.world.door.layers import contents
 from gridworld.world.door.observations import content
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 

@@ -26,8 +26,8 @@ from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.observations import KINDS, ObservationTable, TableObservation, make_observation
 from gridworld.envs.rendering import frame_size
 from gridworld.world.door import known
-from gridworld.world.door.layers import layers_of
-from gridworld.world.door.search import traits
+from gridworld.world.door.attributes import layers_of
+from gridworld.world.door.traits import traits
 from gridworld.world.door.world import Found
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import Layout, load

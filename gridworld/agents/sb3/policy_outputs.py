@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from gridworld.base.errors import InputError, in_short
 from gridworld.envs.observations import ObservationTable
-from gridworld.world.door.layers import random_states
+from gridworld.world.door.attributes import random_states
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 CHUNK = 4096  # states a forward pass

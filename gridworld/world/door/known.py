@@ -25,6 +25,7 @@ _NEUTRAL = (
 )
 _NEUTRAL_ELSEWHERE = (("stable_baselines3.common.monitor", "Monitor"),)
 _ONE_STEP = (gym.Wrapper, gym.ObservationWrapper, gym.RewardWrapper, gym.ActionWrapper)
+_FACING = ("right", "down", "left", "up")  # minigrid's directions
 # What only draws, sounds or waits: it is no state.
 _KEPT = (
     ("pygame.time", "Clock"),
@@ -80,6 +81,19 @@ def _is_kept(kind: type, loaded: tuple[Any, ...]) -> bool:
 def is_kept(kind: type) -> bool:
     """Whether objects of a class are no state."""
     return _is_kept(kind, _loaded(_KEPT))
+
+
+def place_of(env: Any) -> tuple[str, tuple[str, int, int]] | None:
+    """The name of a state of MiniGrid's environments, and its place: which way, row and column."""
+    place, direction = (getattr(env, name, None) for name in ("agent_pos", "agent_dir"))
+    try:
+        column, row = (int(each) for each in place)  # type: ignore[union-attr]
+        facing = f"facing {_FACING[direction]}"  # type: ignore[index]
+    except (TypeError, ValueError, IndexError):
+        return None
+    if carried := getattr(getattr(env, "carrying", None), "type", None):
+        facing += f", carrying a {carried}"
+    return f"row {row + 1}, column {column + 1}, {facing}", (facing, row, column)
 
 
 def _hands(env: Any) -> Any:

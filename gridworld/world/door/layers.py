@@ -10,16 +10,10 @@ the one that takes every outcome. The environment gets back its own attributes i
 from __future__ import annotations
 
 import collections
-import copyreg
-import functools
-import hashlib
-import inspect
 import io
 import itertools
 import math
-import pickle
 import random
-import sys
 import types
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -31,18 +25,27 @@ import numpy as np
 
 from gridworld.base.errors import InputError, in_short
 from gridworld.world.door import known
+from gridworld.world.door.attributes import (
+    GENERATORS,
+    attributes,
+    layers_of,
+    own_spaces,
+    random_states,
+    set_attributes,
+    spaces_in,
+    state_of,
+)
+from gridworld.world.door.copies import ATOMS, Copier, Reader, Recorder, SharedCopier
+from gridworld.world.door.stand_ins import Limited, Recorded
 from gridworld.world.door.uniform import Uniform
 
 Env = gym.Env[Any, Any]
-_ATOMS = frozenset({type(None), bool, int, float, complex, str, bytes, *np.sctypeDict.values()})
 _CODE = (type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, np.ufunc)
 _KEPT = (gym.Space, gym.envs.registration.EnvSpec, *_CODE)
 _SMALL, _LARGE = 1024, 256  # bytes of all copies, up to which all is copied; beyond it, of one attribute
 _PLAIN = frozenset({list, tuple, dict, set, frozenset, collections.deque})
-_CONTAINERS = (list, tuple, dict, set, frozenset, np.ndarray)  # whose own reduction holds their items
 
 
-GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
 _MARK = object()  # in place of any generator
 
 
@@ -52,56 +55,6 @@ class Changed(Exception):  # noqa: N818
     def __init__(self, found: Sequence[tuple[int, str]]) -> None:
         super().__init__(found)
         self.found = found
-
-
-class Timed(BaseException):  # which an environment's `except Exception` does not catch
-    """A wrapper reads or changes what a time limit below it does, so that its count is state."""
-
-
-class Limited(gym.Wrapper[Any, Any, Any, Any]):
-    """Stands for a time limit: it counts the steps of one step, and cuts the episode when it is told to."""
-
-    def __init__(self, env: Env) -> None:
-        super().__init__(env)
-        self.steps, self.cuts = 0, False
-
-    def step(self, action: Any) -> Any:
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self.steps += 1
-        return observation, reward, terminated, truncated or self.cuts, info
-
-    @property
-    def _elapsed_steps(self) -> int:
-        raise Timed
-
-
-class _Told(dict[str, Any]):
-    """The `info` of a step, below a wrapper that may look for what a recording adds to it."""
-
-    def __contains__(self, key: object) -> bool:
-        if key == "episode":
-            raise InputError(
-                "env: a wrapper reads info['episode'] of a recording below it, which is left out; let it "
-                "sum up "
-                "what it needs itself"
-            )
-        return super().__contains__(key)
-
-    def __getitem__(self, key: str) -> Any:
-        if key in self:
-            return super().__getitem__(key)
-        raise KeyError(key)
-
-    def get(self, key: str, default: Any = None) -> Any:
-        return super().__getitem__(key) if key in self else default
-
-
-class _Recorded(gym.Wrapper[Any, Any, Any, Any]):
-    """Stands for a recording (Monitor, RecordEpisodeStatistics) below a wrapper with a step of its own."""
-
-    def step(self, action: Any) -> Any:
-        *shown, info = self.env.step(action)
-        return *shown, _Told(info)
 
 
 class Layers:
@@ -132,7 +85,7 @@ class Layers:
                 self.layers.append(layer)
                 chain.append(layer)
             elif known.records(layer) and not all(map(known.steps_once, self.layers)):
-                chain.append(_Recorded(layer.env))
+                chain.append(Recorded(layer.env))
         self._chain = chain  # without the neutral ones
         self.may_see_cuts = self.limited is not None and not all(map(known.steps_once, self.layers[:-1]))
         self.env: Any = self.layers[0]
@@ -150,8 +103,8 @@ class Layers:
     def restored(self) -> Iterator[None]:
         """Work on copies; in the end every layer holds the very objects that it held."""
         before = [(layer, attributes(layer)) for layer in self.layers]
-        values = [each for layer, held in before for each in (*held.values(), *_own_spaces(layer))]
-        spaces = {id(space): (space, vars(space).get("_np_random")) for space in _spaces(values)}.values()
+        values = [each for layer, held in before for each in (*held.values(), *own_spaces(layer))]
+        spaces = {id(space): (space, vars(space).get("_np_random")) for space in spaces_in(values)}.values()
         self._shared = random_states()
         try:
             self._adopt()
@@ -227,7 +180,7 @@ class Layers:
             for number in range(len(self.layers))
         ]
         self._digest_left = self._content_left()
-        recorder = _Recorder(self)
+        recorder = Recorder(self)
         for _, value in itertools.chain.from_iterable(self._left):
             recorder.dump(value)
         # One object stays one, wherever it is held.
@@ -236,7 +189,7 @@ class Layers:
 
     def _is_one(self, value: Any) -> bool:
         """Whether a value cannot change but by another in its place."""
-        return type(value) in _ATOMS or id(value) in self.fixed
+        return type(value) in ATOMS or id(value) in self.fixed
 
     def leave_nothing(self) -> None:
         """Everything is in the copies."""
@@ -261,7 +214,7 @@ class Layers:
             found = attributes(layer)
             for name, value in left:
                 now = found.pop(name, Changed)
-                if now is not value and not (type(now) is type(value) in _ATOMS and now == value):
+                if now is not value and not (type(now) is type(value) in ATOMS and now == value):
                     raise Changed([(number, name)])
             held.append(sorted((item for item in found.items() if item[0] not in without), key=itemgetter(0)))
         return held
@@ -295,11 +248,11 @@ class Layers:
         buffer = io.BytesIO()
         known_objects = self._known if known_objects is None else known_objects
         shares = self._shares and known_objects is self._known
-        (_Pickler if shares else _Copier)(buffer, self, known_objects).dump(thing)
+        (SharedCopier if shares else Copier)(buffer, self, known_objects).dump(thing)
         return buffer.getvalue()
 
     def _load(self, copy: bytes) -> Any:
-        return _Unpickler(io.BytesIO(copy), self._known, self.branching).load()
+        return Reader(io.BytesIO(copy), self._known, self.branching).load()
 
     def _keep(self, thing: Any) -> int:
         self.fixed[id(thing)] = self._known[id(thing)] = thing
@@ -329,169 +282,6 @@ class Layers:
         return None
 
 
-class _Copier(pickle.Pickler):
-    """Copies what no attribute left in place shares a list or a dictionary with."""
-
-    def __init__(self, file: io.BytesIO, held: Layers, known_objects: dict[Any, Any]) -> None:
-        super().__init__(file, protocol=5)
-        self._held, self._known = held, known_objects
-        self._views: dict[int, list[Any]] = {}  # arrays by that whose memory they show
-
-    def reducer_override(self, obj: Any) -> Any:
-        if obj is _kept:
-            return NotImplemented
-        key = id(obj) if id(obj) in self._known else None
-        if key is None and type(obj) not in self._held.ordinary:
-            key = self._held.reference(obj)
-        return (_kept, (key,)) if key is not None else self._taken_apart(obj)
-
-    def _taken_apart(self, obj: Any) -> Any:
-        if isinstance(obj, np.ndarray):
-            views = self._views.setdefault(id(obj if obj.base is None else obj.base), [])
-            if any(np.may_share_memory(obj, each) for each in views):
-                raise TypeError("two arrays share memory; hold one of them")
-            views.append(obj)
-        elif _is_taken_apart(_kind(obj)):
-            held = attributes(obj)
-            if self._held.is_adopting and isinstance(obj, gym.Env):  # which would make a generator when asked
-                held["_np_random"] = self._held.branching
-            return _new, (type(obj),), held, None, None, set_attributes
-        return NotImplemented
-
-
-class _Pickler(_Copier):
-    """Asks of lists and dictionaries too whether they are known, which takes three times as long."""
-
-    def persistent_id(self, obj: Any) -> Any:
-        kind = type(obj)
-        if kind in _ATOMS or obj is _kept:
-            return None
-        if (key := id(obj)) in self._known:
-            return key
-        return None if kind in self._held.ordinary else self._held.reference(obj)
-
-    def reducer_override(self, obj: Any) -> Any:
-        return self._taken_apart(obj)
-
-
-class _Recorder(_Pickler):
-    """Notes every object within what it is given."""
-
-    def __init__(self, held: Layers) -> None:
-        super().__init__(io.BytesIO(), held, held.fixed)
-        self.met: list[Any] = []
-
-    def persistent_id(self, obj: Any) -> Any:
-        found = super().persistent_id(obj)
-        if found is None and type(obj) not in _ATOMS:
-            self.met.append(obj)
-        return found
-
-
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, file: io.BytesIO, known_objects: dict[Any, Any], branching: Any) -> None:
-        super().__init__(file)
-        self._known, self._branching = known_objects, branching
-
-    def persistent_load(self, key: Any) -> Any:
-        if isinstance(key, tuple):  # a number drawn in an earlier step, which nothing may compare any more
-            return Uniform.of_earlier(self._branching, *key[1:])
-        return self._known[key]
-
-    def find_class(self, module: str, name: str) -> Any:
-        ours = (module, name) == (_kept.__module__, _kept.__name__)
-        return self.persistent_load if ours else super().find_class(module, name)
-
-
-def _kept(key: Any) -> Any:
-    """What a copy says in place of an object that is kept as it is; `_Unpickler` reads it."""
-    raise NotImplementedError
-
-
-_new: Any = vars(copyreg)["__newobj__"]  # which pickle knows as a call of __new__
-
-
-def _kind(thing: Any) -> Any:
-    return type(thing)
-
-
-def layers_of(env: Any) -> list[Any]:
-    """An environment's wrappers, the outermost first, and at last itself."""
-    found = [env]
-    while isinstance(found[-1], gym.Wrapper):
-        found.append(found[-1].env)
-    return found
-
-
-def attributes(thing: Any) -> dict[str, Any]:
-    """What an object holds, in slots too."""
-    found = dict(getattr(thing, "__dict__", {}))
-    for name in _slots(_kind(thing)):
-        try:
-            found[name] = getattr(thing, name)
-        except AttributeError:
-            continue
-    return found
-
-
-def set_attributes(thing: Any, held: dict[str, Any]) -> None:
-    """Make an object hold this and nothing else."""
-    slots = _slots(_kind(thing))
-    if hasattr(thing, "__dict__"):
-        vars(thing).clear()
-        vars(thing).update({name: value for name, value in held.items() if name not in slots})
-    for name in slots:
-        if name in held:
-            object.__setattr__(thing, name, held[name])
-        elif hasattr(thing, name):
-            object.__delattr__(thing, name)
-
-
-@functools.lru_cache(1024)
-def _slots(kind: Any) -> tuple[str, ...]:
-    names = (
-        name
-        for each in kind.__mro__
-        for name, member in vars(each).items()
-        if inspect.ismemberdescriptor(member)
-    )
-    return tuple(name for name in names if name not in ("__dict__", "__weakref__"))
-
-
-@functools.lru_cache(1024)
-def _is_taken_apart(kind: Any) -> bool:
-    """Whether its instances are copied attribute by attribute, for their own way may leave something out."""
-    if issubclass(kind, gym.Env):
-        return True
-    root = kind.__module__.partition(".")[0]
-    if (
-        root in sys.stdlib_module_names
-        or root in ("numpy", "torch", "pygame")
-        or issubclass(kind, _CONTAINERS)
-    ):
-        return root == "__main__" and not issubclass(kind, _CONTAINERS) and _has_its_own_way(kind)
-    return _has_its_own_way(kind)
-
-
-def _has_its_own_way(kind: type) -> bool:
-    own = ("__getstate__", "__reduce__", "__reduce_ex__")
-    return any(getattr(kind, name, None) is not getattr(object, name, None) for name in own)
-
-
-def _own_spaces(layer: Any) -> list[Any]:
-    return [
-        getattr(layer, name, None) for name in ("action_space", "observation_space")
-    ]  # of its class, maybe
-
-
-def _spaces(held: Any) -> Iterator[gym.Space[Any]]:
-    for each in held:
-        if isinstance(each, gym.Space):
-            yield each
-            inner = getattr(each, "spaces", ())
-            yield from _spaces(inner.values() if isinstance(inner, dict) else inner)
-
-
 def contents(env: Env) -> dict[str, bytes]:
     """The content of each attribute of an environment, to compare it with another's."""
     layers = Layers("env", env.unwrapped, _MARK)
@@ -500,19 +290,3 @@ def contents(env: Env) -> dict[str, bytes]:
         name for name, value in attributes(layers.base).items() if isinstance(value, (*_KEPT, *GENERATORS))
     }
     return {name: value for (_, name), value in layers.values([*skipped, "_np_random_seed"]).items()}
-
-
-def random_states() -> list[Any]:
-    """The states of the generators that all share."""
-    torch = sys.modules.get("torch")
-    found = [] if torch is None else [torch.get_rng_state().numpy().tobytes()]
-    numpys: Any = np.random.get_state(legacy=False)["state"]
-    return [*found, random.getstate(), (numpys["key"].tobytes(), numpys["pos"])]
-
-
-def state_of(generator: Any) -> bytes:
-    """The state of a random generator."""
-    if isinstance(generator, random.Random):
-        return hashlib.sha256(repr(generator.getstate()).encode()).digest()
-    bits = getattr(generator, "bit_generator", None)
-    return pickle.dumps(generator.get_state(legacy=False) if bits is None else bits.state)

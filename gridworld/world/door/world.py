@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from gridworld.base.user_input import check_memory
 from gridworld.world.door.beliefs import Beliefs, Node
+from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES
 from gridworld.world.door.layers import Env
-from gridworld.world.door.search import MOST_SECONDS, MOST_STATES, Named, Search, State
+from gridworld.world.door.search import Named, Search, State
 from gridworld.world.door.word import NO_LIMIT
 from gridworld.world.mdp import ENUMERATED, Mdp, taken
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
@@ -80,7 +81,7 @@ def enumerated(
         search.explore()
         return _World(search, name or type(env.unwrapped).__name__, by_word=state is not None).found
     finally:
-        search.clear()
+        search.budget.clear()
 
 
 class _World:
@@ -98,9 +99,14 @@ class _World:
             [[each._replace(following=classes[each.following]) for each in row] for row in found[0].steps]
             for found in self.members[:-1]
         ]
-        starts = [(each.probability, classes[each.following], each.seen) for each in search.starts]
+        starts = [(each.probability, classes[each.following], each.seen) for each in search.resets.starts]
         self.beliefs = beliefs = Beliefs(
-            starts, [*first, []], search.refusal, MOST_STATES, search.seconds_left(), search.show
+            starts,
+            [*first, []],
+            search.refusal,
+            MOST_STATES,
+            search.budget.seconds_left(),
+            search.budget.show,
         )
         space, numbers, size = search.env.observation_space, *self._numbers()
         named: list[Named] = [self._unreached(number) for number in range(size)]

@@ -20,8 +20,9 @@ from gymnasium.utils import seeding
 from gridworld.base.errors import OLD_GYM, InputError, in_short, install_command
 from gridworld.base.user_input import named_object
 from gridworld.world.door import known
-from gridworld.world.door.layers import Env, layers_of, random_states, state_of
-from gridworld.world.door.search import traits
+from gridworld.world.door.attributes import layers_of, random_states, state_of
+from gridworld.world.door.layers import Env
+from gridworld.world.door.traits import traits
 from gridworld.world.door.world import Found, enumerated
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources.gymnasium_table import compile_table, has_table

@@ -1,0 +1,97 @@
+"""The attributes of objects, and the states of random generators."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import inspect
+import pickle
+import random
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
+
+
+def layers_of(env: Any) -> list[Any]:
+    """An environment's wrappers, the outermost first, and at last itself."""
+    found = [env]
+    while isinstance(found[-1], gym.Wrapper):
+        found.append(found[-1].env)
+    return found
+
+
+def attributes(thing: Any) -> dict[str, Any]:
+    """What an object holds, in slots too."""
+    found = dict(getattr(thing, "__dict__", {}))
+    for name in _slots(kind_of(thing)):
+        try:
+            found[name] = getattr(thing, name)
+        except AttributeError:
+            continue
+    return found
+
+
+def set_attributes(thing: Any, held: dict[str, Any]) -> None:
+    """Make an object hold this and nothing else."""
+    slots = _slots(kind_of(thing))
+    if hasattr(thing, "__dict__"):
+        vars(thing).clear()
+        vars(thing).update({name: value for name, value in held.items() if name not in slots})
+    for name in slots:
+        if name in held:
+            object.__setattr__(thing, name, held[name])
+        elif hasattr(thing, name):
+            object.__delattr__(thing, name)
+
+
+@functools.lru_cache(1024)
+def _slots(kind: Any) -> tuple[str, ...]:
+    names = (
+        name
+        for each in kind.__mro__
+        for name, member in vars(each).items()
+        if inspect.ismemberdescriptor(member)
+    )
+    return tuple(name for name in names if name not in ("__dict__", "__weakref__"))
+
+
+def own_spaces(layer: Any) -> list[Any]:
+    """The spaces of a layer, which may be its class's."""
+    return [
+        getattr(layer, name, None) for name in ("action_space", "observation_space")
+    ]  # of its class, maybe
+
+
+def spaces_in(held: Any) -> Iterator[gym.Space[Any]]:
+    """The spaces among some values, and within these."""
+    for each in held:
+        if isinstance(each, gym.Space):
+            yield each
+            inner = getattr(each, "spaces", ())
+            yield from spaces_in(inner.values() if isinstance(inner, dict) else inner)
+
+
+def random_states() -> list[Any]:
+    """The states of the generators that all share."""
+    torch = sys.modules.get("torch")
+    found = [] if torch is None else [torch.get_rng_state().numpy().tobytes()]
+    numpys: Any = np.random.get_state(legacy=False)["state"]
+    return [*found, random.getstate(), (numpys["key"].tobytes(), numpys["pos"])]
+
+
+def state_of(generator: Any) -> bytes:
+    """The state of a random generator."""
+    if isinstance(generator, random.Random):
+        return hashlib.sha256(repr(generator.getstate()).encode()).digest()
+    bits = getattr(generator, "bit_generator", None)
+    return pickle.dumps(generator.get_state(legacy=False) if bits is None else bits.state)
+
+
+def kind_of(thing: Any) -> Any:
+    """Its class, of which nothing is known."""
+    return type(thing)

@@ -1,0 +1,94 @@
+"""What a search may take, how far it is, and what keeps growing where that is too much."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from gridworld.base.console import ProgressLine
+from gridworld.base.user_input import check_memory
+
+if TYPE_CHECKING:
+    from gridworld.world.door.search import Search
+
+MOST_STATES, MOST_SECONDS = 200_000, 120.0
+_MOST_BYTES = 2**31  # of all copies and observations together
+SAMPLED = 16  # of so many states the copy of one is kept, to name what keeps changing
+_MOST_SAMPLES = 1_000
+_BETWEEN_LOOKS, _BETWEEN_LINES, _SLOW = 0.5, 3.0, 6.0  # seconds: of progress on a terminal, and elsewhere
+
+
+class Budget:
+    """The states and the seconds of a search; its progress is shown from the first second on."""
+
+    def __init__(self, search: Search, most_states: int, most_seconds: float) -> None:
+        self._search, self.most_states, self._most_seconds = search, most_states, most_seconds
+        self._began = time.monotonic()
+        self._line, self._due = ProgressLine(enabled=True, seconds_between_lines=_BETWEEN_LINES), 1.0
+        self._growing = ""
+        self.begin()
+
+    def begin(self) -> None:
+        """Nothing is found yet, as where a search begins again."""
+        self.num_bytes, self.most_now = 0, self.most_states
+
+    def seconds_left(self) -> float:
+        """Of those that it may take."""
+        return self._most_seconds - (time.monotonic() - self._began)
+
+    def add(self, size: int) -> None:
+        """Another state was found, whose copy has so many bytes."""
+        search, self.num_bytes = self._search, self.num_bytes + size
+        if len(search.states) > self.most_now:
+            raise search.refusal(
+                f"more than {self.most_now:,} states can be reached, too many to solve, since its "
+                f"{self.what_changes()}"
+            )
+        if self.num_bytes > _MOST_BYTES:
+            most = f"{_MOST_BYTES / 2**30:.0f} GiB"
+            raise search.refusal(f"copies of the first {len(search.states):,} states take more than {most}")
+        check_memory(search.where, self.num_bytes)
+
+    def check_seconds(self) -> None:
+        """Refuse to go on where its time is over."""
+        if self.seconds_left() < 0:
+            found = f"it still finds new states ({len(self._search.states):,} so far)"
+            raise self._search.refusal(
+                f"after {self._most_seconds:.0f} s {found}, since its {self.what_changes()}"
+            )
+
+    def show(self, what: str) -> None:
+        """Show how far it is, and after some seconds what keeps growing, too."""
+        seconds = time.monotonic() - self._began
+        if seconds >= self._due:
+            self._due = seconds + _BETWEEN_LOOKS
+            if seconds > _SLOW and not self._growing:
+                self._growing = f"; {self._most_values()} keeps changing"
+            where = self._search.where
+            self._line.show(lambda: f"{where}: {what}, {seconds:.0f} s{self._growing}; Ctrl-C ends it")
+
+    def clear(self) -> None:
+        """Remove that line from a terminal."""
+        self._line.clear()
+
+    def _most_values(self) -> str:
+        """The attributes with the most values, the elapsed time among them."""
+        values: dict[str, set[bytes]] = {}
+        layers, ignore = self._search.layers, self._search.ignore
+        for copy in [each.copy for each in self._search.states[::SAMPLED] if each.copy][-_MOST_SAMPLES:]:
+            layers.put(copy)
+            for (_, name), key in layers.values(ignore).items():
+                values.setdefault(name, set()).add(key)
+        most = max(map(len, values.values()), default=0)
+        return ", ".join(sorted(name for name, found in values.items() if len(found) == most)) or "state"
+
+    def what_changes(self) -> str:
+        """What keeps changing, and a remedy, as the rest of a sentence."""
+        names = self._most_values()
+        first, by_settings = names.split(",")[0], self._search.where.startswith("env.id")
+        limit = "env.kwargs.max_episode_steps" if by_settings else "gymnasium.wrappers.TimeLimit"
+        ignored = f"env.ignore=[{first}]" if by_settings else f'ignore=["{first}"]'
+        return (
+            f"{names} keeps changing; use a smaller one, set a limit ({limit}), or ignore irrelevant "
+            f"attributes, e.g. {ignored}"
+        )

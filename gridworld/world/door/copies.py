@@ -1,0 +1,124 @@
+"""Copies of what layers hold, by pickle: what is kept as it is is named, and the rest taken apart."""
+
+from __future__ import annotations
+
+import copyreg
+import functools
+import io
+import pickle
+import sys
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+
+from gridworld.world.door.attributes import attributes, kind_of, set_attributes
+from gridworld.world.door.uniform import Uniform
+
+if TYPE_CHECKING:
+    from gridworld.world.door.layers import Layers
+
+ATOMS = frozenset({type(None), bool, int, float, complex, str, bytes, *np.sctypeDict.values()})
+_CONTAINERS = (list, tuple, dict, set, frozenset, np.ndarray)  # whose own reduction holds their items
+
+
+class Copier(pickle.Pickler):
+    """Copies what no attribute left in place shares a list or a dictionary with."""
+
+    def __init__(self, file: io.BytesIO, held: Layers, known_objects: dict[Any, Any]) -> None:
+        super().__init__(file, protocol=5)
+        self._held, self._known = held, known_objects
+        self._views: dict[int, list[Any]] = {}  # arrays by that whose memory they show
+
+    def reducer_override(self, obj: Any) -> Any:
+        if obj is _kept:
+            return NotImplemented
+        key = id(obj) if id(obj) in self._known else None
+        if key is None and type(obj) not in self._held.ordinary:
+            key = self._held.reference(obj)
+        return (_kept, (key,)) if key is not None else self._taken_apart(obj)
+
+    def _taken_apart(self, obj: Any) -> Any:
+        if isinstance(obj, np.ndarray):
+            views = self._views.setdefault(id(obj if obj.base is None else obj.base), [])
+            if any(np.may_share_memory(obj, each) for each in views):
+                raise TypeError("two arrays share memory; hold one of them")
+            views.append(obj)
+        elif _is_taken_apart(kind_of(obj)):
+            held = attributes(obj)
+            if self._held.is_adopting and isinstance(obj, gym.Env):  # which would make a generator when asked
+                held["_np_random"] = self._held.branching
+            return _new, (type(obj),), held, None, None, set_attributes
+        return NotImplemented
+
+
+class SharedCopier(Copier):
+    """Asks of lists and dictionaries too whether they are known, which takes three times as long."""
+
+    def persistent_id(self, obj: Any) -> Any:
+        kind = type(obj)
+        if kind in ATOMS or obj is _kept:
+            return None
+        if (key := id(obj)) in self._known:
+            return key
+        return None if kind in self._held.ordinary else self._held.reference(obj)
+
+    def reducer_override(self, obj: Any) -> Any:
+        return self._taken_apart(obj)
+
+
+class Recorder(SharedCopier):
+    """Notes every object within what it is given."""
+
+    def __init__(self, held: Layers) -> None:
+        super().__init__(io.BytesIO(), held, held.fixed)
+        self.met: list[Any] = []
+
+    def persistent_id(self, obj: Any) -> Any:
+        found = super().persistent_id(obj)
+        if found is None and type(obj) not in ATOMS:
+            self.met.append(obj)
+        return found
+
+
+class Reader(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, known_objects: dict[Any, Any], branching: Any) -> None:
+        super().__init__(file)
+        self._known, self._branching = known_objects, branching
+
+    def persistent_load(self, key: Any) -> Any:
+        if isinstance(key, tuple):  # a number drawn in an earlier step, which nothing may compare any more
+            return Uniform.of_earlier(self._branching, *key[1:])
+        return self._known[key]
+
+    def find_class(self, module: str, name: str) -> Any:
+        ours = (module, name) == (_kept.__module__, _kept.__name__)
+        return self.persistent_load if ours else super().find_class(module, name)
+
+
+def _kept(key: Any) -> Any:
+    """What a copy says in place of an object that is kept as it is; `Reader` reads it."""
+    raise NotImplementedError
+
+
+_new: Any = vars(copyreg)["__newobj__"]  # which pickle knows as a call of __new__
+
+
+@functools.lru_cache(1024)
+def _is_taken_apart(kind: Any) -> bool:
+    """Whether its instances are copied attribute by attribute, for their own way may leave something out."""
+    if issubclass(kind, gym.Env):
+        return True
+    root = kind.__module__.partition(".")[0]
+    if (
+        root in sys.stdlib_module_names
+        or root in ("numpy", "torch", "pygame")
+        or issubclass(kind, _CONTAINERS)
+    ):
+        return root == "__main__" and not issubclass(kind, _CONTAINERS) and _has_its_own_way(kind)
+    return _has_its_own_way(kind)
+
+
+def _has_its_own_way(kind: type) -> bool:
+    own = ("__getstate__", "__reduce__", "__reduce_ex__")
+    return any(getattr(kind, name, None) is not getattr(object, name, None) for name in own)

@@ -1,0 +1,36 @@
+"""Whether two environments are one task, as far as a walk and what never changes show."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from gridworld.world.door.attributes import attributes
+from gridworld.world.door.layers import Env, Layers
+from gridworld.world.door.rejection import Rejecting
+from gridworld.world.door.search import Search
+from gridworld.world.door.walks import walk
+
+
+def traits(env: Env) -> Any:
+    """What two environments that are one task have in common: a walk, and what never changes."""
+    search = Search("env", env)
+    branching = Rejecting("env", bytes, ())
+    search.layers, search.branching = Layers("env", env, branching), branching
+    with search.layers.restored():
+        held = {
+            (number, name): value
+            for number, layer in enumerate(search.layers.layers)
+            for name, value in attributes(layer).items()
+        }
+        before = search.layers.values()
+        shown = walk(search, np.int64)
+        after = search.layers.values()
+    constant: dict[Any, Any] = {
+        key: held[key] if isinstance(held[key], gym.Space) else value
+        for key, value in before.items()
+        if after.get(key) == value and held[key] is not branching
+    }
+    return [type(each) for each in search.layers.layers], search.layers.limit, constant, shown
