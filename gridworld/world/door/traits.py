@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from gridworld.world.door.attributes import attributes
 from gridworld.world.door.layers import Env, Layers
@@ -29,7 +30,7 @@ def traits(env: Env) -> Any:
         shown = walk(search, np.int64)
         after = search.layers.values()
     constant: dict[Any, Any] = {
-        key: held[key] if isinstance(held[key], gym.Space) else value
+        key: held[key] if isinstance(held[key], gym.Space | EnvSpec) else value
         for key, value in before.items()
         if after.get(key) == value and held[key] is not branching
     }
