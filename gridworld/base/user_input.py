@@ -174,11 +174,15 @@ def named_object(where: str, name: str) -> Any:
     file = (users_folder() / place).resolve() if place.endswith(".py") else None
     if file is not None and not file.is_file():
         raise InputError(f"{where}={name}: no file {place}; give module:NAME or folder/module.py:NAME")
-    folder = str(users_folder() if file is None else file.parent)
-    if folder not in sys.path:
-        sys.path.append(folder)  # as the last, so that nothing that is installed is hidden
-    importlib.invalidate_caches()
+    search(users_folder() if file is None else file.parent)
     return _named(f"{where}={name}", place if file is None else file.stem, attribute, file)
+
+
+def search(folder: Path) -> None:
+    """Let Python find the modules in a folder, after all that is installed."""
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
+    importlib.invalidate_caches()
 
 
 def imported(where: str, path: Any) -> Any:

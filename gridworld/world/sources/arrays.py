@@ -39,7 +39,16 @@ from gymnasium.spaces import Dict
 from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError, in_short
-from gridworld.base.user_input import DAMAGED, check_memory, imported, npz_arrays, npz_bytes, open_users_file
+from gridworld.base.user_input import (
+    DAMAGED,
+    check_memory,
+    imported,
+    npz_arrays,
+    npz_bytes,
+    open_users_file,
+    search,
+    users_folder,
+)
 from gridworld.world.mdp import Mdp, frozen, leaves_of
 from gridworld.world.outcomes import (
     MOST_STATES,
@@ -142,6 +151,7 @@ def build(builder: str | Callable[..., Any], kwargs: Mapping[str, Any] | None = 
         The world, named after the function unless what that returns has a name.
     """
     where = f"env.builder={_name_of(builder) if callable(builder) else str(builder)[:200]}"
+    search(users_folder())
     function = imported("env.builder", builder) if isinstance(builder, str) else builder
     if not callable(function):
         raise InputError(f"{where}: must be the import path of a function, e.g. my_package.worlds.make")
