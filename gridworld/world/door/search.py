@@ -25,6 +25,7 @@ from gridworld.base.errors import GYMNASIUM, InputError, in_short, on_a_line
 from gridworld.world.door import known
 from gridworld.world.door.beliefs import Step, lumped
 from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES, SAMPLED, Budget
+from gridworld.world.door.clock import watched
 from gridworld.world.door.layers import Changed, Env, Layers
 from gridworld.world.door.observations import leaves
 from gridworld.world.door.rejection import Rejecting
@@ -114,10 +115,11 @@ class Search:
 
     def explore(self) -> None:
         """Find all states that can be reached, and what every action does there."""
-        try:
-            self._explored(counts_time=False)
-        except (_Missing, Timed):  # something reads what is around it: a time limit's count, say
-            self._explored(counts_time=True)
+        with watched() as self.clock_readers:
+            try:
+                self._explored(counts_time=False)
+            except (_Missing, Timed):  # something reads what is around it: a time limit's count, say
+                self._explored(counts_time=True)
 
     def _explored(self, counts_time: bool) -> None:
         runs = (Search.reset_from.__code__, Search.stepped_from.__code__)

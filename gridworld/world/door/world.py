@@ -185,7 +185,9 @@ class _World:
         else:
             found = f"{ENUMERATED}, {len(nodes):,} beliefs about {size:,} hidden states{without}"
         aliased = self.beliefs.num_aliased()
-        return f"{found}; {aliased:,} observations stand for several of them" if aliased else found
+        found += f"; {aliased:,} observations stand for several of them" if aliased else ""
+        readers = sorted(self.search.clock_readers)
+        return f"{found}; the clock is read ({', '.join(readers[:3])})" if readers else found
 
 
 def _renumbered(outcomes: Outcomes, numbers: NDArray[Any], size: int) -> Outcomes:

@@ -1,6 +1,8 @@
 """What is another world in another process is found out; what is found in another order is the same."""
 
+import re
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from gridworld.api.worlds import compile_env
 from gridworld.base.errors import InputError
 from gridworld.checking.examine import examine
 from gridworld.config.compose import named_world
@@ -140,3 +143,22 @@ def test_a_digest_of_the_content_is_that_of_any_order() -> None:
 def shows(mdp: Any, shown: Any) -> Any:
     """The world in which states show these numbers, several the same."""
     return replace(mdp, own_observation=shown[mdp.number])
+
+
+def test_reading_the_clock_is_named() -> None:
+    class Slow(gym.Env[int, int]):
+        observation_space, action_space = spaces.Discrete(2), spaces.Discrete(2)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            super().reset(seed=seed)
+            time.sleep(0)
+            return 0, {}
+
+        def step(self, action: int) -> Any:
+            self.drawn = time.time() > 0
+            return int(action), float(action), bool(action), False, {}
+
+    before = time.time
+    truth = compile_env(Slow()).truth
+    assert time.time is before
+    assert re.fullmatch(r"enumerated, 2 states; the clock is read \(test_elsewhere.py:\d+\)", truth)
