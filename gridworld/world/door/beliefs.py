@@ -74,10 +74,12 @@ class Node:
 
     belief: Belief
     seen: bytes
+    depth: int  # steps from the start
     rows: list[list[Step]] = field(default_factory=list)  # by actions; empty where none was tried
 
 
 _OFTEN = 100  # of so many nodes one shows how far it is
+_BEYOND = 1_000  # nodes further than a step limit that are found too, so that a small world is whole
 
 
 class Beliefs:
@@ -90,6 +92,7 @@ class Beliefs:
         most: more nodes are refused.
         most_seconds: the time after which it is given up.
         show: shows how far it is.
+        limit: steps of an episode; of a few nodes more, what follows in them is not asked.
     """
 
     def __init__(
@@ -100,24 +103,39 @@ class Beliefs:
         most: int,
         most_seconds: float = math.inf,
         show: Callable[[str], None] = lambda what: None,
+        limit: int | None = None,
     ) -> None:
         self._refusal, self._most, self._num_parts = refusal, most, 0
         self._until = time.monotonic() + most_seconds
         self.nodes: list[Node] = []
         self._numbers: dict[tuple[Belief, bytes], int] = {}
+        self._depth = 0  # of nodes that are found now
         first: dict[bytes, list[tuple[int, Fraction]]] = {}
         for probability, hidden, seen in starts:
             first.setdefault(seen, []).append((hidden, probability))
         self.starts = [self._node(parts, seen) for seen, parts in first.items()]  # probability and node
+        beyond, size = math.inf, 0  # the first node at the limit, and how many there were when it came
         for number, node in enumerate(self.nodes):  # which grows
             if not number % _OFTEN:
                 show(f"{len(self.nodes):,} distributions over its states")
-            held = [(steps[number], probability) for number, probability in node.belief]
-            if all(each for each, _ in held):
-                node.rows = [
-                    self._row([(each[action], probability) for each, probability in held])
-                    for action in range(len(held[0][0]))
-                ]
+            if limit is not None and node.depth >= limit and beyond == math.inf:
+                beyond, size = number, len(self.nodes)
+                self._most = min(self._most, size + _BEYOND)
+            held = [(steps[hidden], probability) for hidden, probability in node.belief]
+            self._depth = node.depth + 1
+            try:
+                if all(each for each, _ in held):
+                    node.rows = [
+                        self._row([(each[action], probability) for each, probability in held])
+                        for action in range(len(held[0][0]))
+                    ]
+            except InputError:
+                if beyond == math.inf:
+                    raise
+                for late in self.nodes[int(beyond) :]:
+                    late.rows = []
+                del self.nodes[size:]
+                break
 
     def _row(self, hidden: Sequence[tuple[Sequence[Step], Fraction]]) -> list[Step]:
         groups: dict[tuple[bytes, float, bool, bool], list[tuple[int, Fraction]]] = {}
@@ -141,7 +159,7 @@ class Beliefs:
         key = belief, seen
         if key not in self._numbers:
             self._numbers[key] = len(self.nodes)
-            self.nodes.append(Node(belief, seen))
+            self.nodes.append(Node(belief, seen, self._depth))
             self._num_parts += len(belief)
             is_long = max(each.denominator.bit_length() for _, each in belief) > _MOST_BITS
             is_many = len(self.nodes) > self._most or self._num_parts > _MOST_PARTS or is_long

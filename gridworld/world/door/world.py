@@ -100,13 +100,16 @@ class _World:
             for found in self.members[:-1]
         ]
         starts = [(each.probability, classes[each.following], each.seen) for each in search.resets.starts]
+        budget, limits = search.budget, (_own_limit(search), search.layers.limit)
+        limit = min((each for each in limits if each is not None), default=None)
         self.beliefs = beliefs = Beliefs(
             starts,
             [*first, []],
             search.refusal,
             MOST_STATES,
-            search.budget.seconds_left(),
-            search.budget.show,
+            budget.seconds_left(),
+            budget.show,
+            limit,
         )
         space, numbers, size = search.env.observation_space, *self._numbers()
         named: list[Named] = [self._unreached(number) for number in range(size)]
@@ -124,7 +127,6 @@ class _World:
         if len(found) == len(named):
             places = np.array([(panels.index(facing), row, column) for facing, row, column in found])
             places[:, 1:] -= places[:, 1:].min(axis=0)  # without the walls around the room
-        limits = [each for each in (_own_limit(search), search.layers.limit) if each is not None]
         rows = stacked(space, iter(zip(*leaves, strict=True)))
         own = of_learners(space, rows)
         mdp = mdp_from_outcomes(
@@ -133,7 +135,7 @@ class _World:
             action_names=_action_names(search),
             places=places,
             panel_names=panels,
-            max_episode_steps=min(limits, default=None),
+            max_episode_steps=limit,
             own_space=own[0],
             own_observation=own[1],
         )

@@ -20,7 +20,7 @@ from gridworld.base.errors import InputError
 from gridworld.world.door import known
 from gridworld.world.door.world import enumerated
 from gridworld.world.evaluation import Evaluator
-from gridworld.world.mdp import Mdp
+from gridworld.world.mdp import Mdp, backup
 
 GAMMA = 0.99
 Result = tuple[Any, float, bool, bool, dict[str, Any]]
@@ -556,3 +556,42 @@ def test_plain_sb3_on_the_tutorials_world() -> None:
             if over:
                 break
     assert total / 300 == pytest.approx(score.value, abs=0.1)
+
+
+class Tiger(gym.Env[int, int]):
+    """A tiger behind one of two doors; who listens hears it behind the right one in 17 of 20 cases."""
+
+    observation_space, action_space = spaces.Discrete(3), spaces.Discrete(3)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.tiger = int(self.np_random.integers(2))
+        return 2, {}
+
+    def step(self, action: int) -> Any:
+        if action < 2:
+            return 2, (-100.0 if action == self.tiger else 10.0), True, False, {}
+        is_right = self.np_random.random() < 0.85
+        return self.tiger if is_right else 1 - self.tiger, -1.0, False, False, {}
+
+
+@pytest.mark.parametrize("limit", [1, 2, 3, 7])
+def test_beliefs_without_end_end_at_the_step_limit(limit: int) -> None:
+    with pytest.raises(InputError, match="what histories say of it has no end"):
+        gridworld.compile_env(Tiger())
+    mdp = gridworld.compile_env(wrappers.TimeLimit(Tiger(), limit))
+
+    def best(left: int, heard: int) -> float:  # by how much more often it was heard behind a door
+        if not left:
+            return 0.0
+        sure = 0.85**heard / (0.85**heard + 0.15**heard)
+        again = sure * 0.85 + (1 - sure) * 0.15
+        closer = best(left - 1, abs(heard - 1)) if heard else best(left - 1, 1)
+        return max(
+            10 * sure - 100 * (1 - sure), -1 + again * best(left - 1, heard + 1) + (1 - again) * closer
+        )
+
+    value = np.zeros(mdp.num_states)
+    for _ in range(limit):
+        value = backup(mdp, value, 1.0).max(axis=1)
+    assert value @ mdp.start == pytest.approx(best(limit, 0), abs=1e-9)
