@@ -88,7 +88,7 @@ class Mdp:
             return self.truth.replace(EXACT, BY_CONSTRUCTION, 1)
         here = "" if ELSEWHERE in self.truth else ", in this process"
         if not self.is_enumerated:
-            return f"by its {self.truth}{here}"
+            return f"by its {self.truth}"
         return f"{self.truth}{here}: as far as its attributes and np_random determine it"
 
     @property

@@ -1,19 +1,19 @@
 """Gymnasium's own environments as worlds, from the transition table that they step by.
 
-Environments of Gymnasium's `toy_text` family have a table `P` and a start distribution:
+FrozenLake, CliffWalking and Taxi have a table `P` and a start distribution:
 
     P[state][action] = [(probability, next state, reward, terminated), ...]
-    initial_state_distrib = (N,) probabilities; isd in older ones
+    initial_state_distrib = (N,) probabilities
 
-Ending belongs to the outcome there; `gridworld.world.outcomes` makes it a state. An environment whose steps
-are not those of its table is refused: in each state every outcome of each action is tried (`table_rows`).
+Ending belongs to the outcome there; `gridworld.world.outcomes` makes it a state. That these step by their
+tables is held by the tests; whatever else has a `P` is searched like any other environment.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
@@ -22,47 +22,39 @@ from numpy.typing import NDArray
 from gridworld.base.errors import InputError
 from gridworld.world.mdp import Mdp, grid_places
 from gridworld.world.outcomes import Outcomes, check_size, mdp_from_outcomes, verified
-from gridworld.world.sources.table_rows import compare_rows
 
 FOLLOWED = "table P, which its steps follow exactly"  # the `truth` of such worlds
-# Gymnasium's own classes and tables whose rows were stepped, once in a process.
-_COMPARED: set[Any] = set()
 
 
-def compile_table(real: gym.Env[Any, Any], limit: int | None = None, name: str | None = None) -> Mdp | None:
-    """Compile the table of an environment without wrappers, which is left as it is; its rows are stepped.
+def compile_table(real: gym.Env[Any, Any], limit: int | None = None, name: str | None = None) -> Mdp:
+    """Compile the table of an environment that `has_table`; `limit` is the step limit of its wrappers.
 
-    `limit` is the step limit of its wrappers. Without a name the world is called by its id or class. None:
-    its state cannot be set, so that its rows cannot be stepped.
+    Without a name the world is called by its id or class.
     """
-    called = name or (real.spec.id if real.spec is not None else type(real).__name__)
-    mdp, table = _compiled(real, called, limit)
-    own = {"step", "reset"} & vars(real).keys()
-    is_gymnasiums = type(real).__module__.startswith("gymnasium.envs.") and not own
-    settings = sorted((key, each) for key, each in vars(real).items() if isinstance(each, bool | float | str))
-    key = (type(real).step, type(real).reset, repr(settings), mdp.text()) if is_gymnasiums else None
-    if key not in _COMPARED:
-        compared = compare_rows(mdp, table, real)
-        if _differ(table, _table(called, real)):
-            raise InputError(
-                f"{called}: its table P changes when it is reset or stepped, so it cannot be solved "
-                "exactly; it must "
-                "not change"
-            )
-        if not compared:
-            return None
-        if key is not None:
-            _COMPARED.add(key)
+    called, given = name or (real.spec.id if real.spec is not None else type(real).__name__), cast(Any, real)
+    sizes, known = (int(given.observation_space.n), int(given.action_space.n)), _KNOWN[type(real).__name__]
+    table = _outcomes(called, given.P, *sizes, given.initial_state_distrib, "initial_state_distrib")
+    mdp = mdp_from_outcomes(
+        called,
+        table,
+        action_names=known.action_names,
+        places=known.places(real),
+        panel_names=known.panel_names,
+        max_episode_steps=limit,
+    )
     return replace(mdp, truth=FOLLOWED)
 
 
 def has_table(env: Any) -> bool:
-    """Whether an environment has a transition table and says where it starts."""
-    return getattr(env, "P", None) is not None and _starts(env) is not None
-
-
-def _starts(env: Any) -> Any:
-    return getattr(env, "initial_state_distrib", getattr(env, "isd", None))
+    """Whether an environment is one of Gymnasium's own that steps by its table."""
+    kind = type(env)
+    is_fickle = getattr(env, "fickle_passenger", False) and getattr(env, "fickle_probability", 1) > 0
+    return (
+        kind.__module__.startswith("gymnasium.envs.toy_text.")
+        and kind.__name__ in _KNOWN
+        and not {"step", "reset"} & vars(env).keys()
+        and not is_fickle  # which its table lacks
+    )
 
 
 def mdp_of_table(table: Any, start: Any, name: str = "P") -> Mdp:
@@ -74,41 +66,6 @@ def mdp_of_table(table: Any, start: Any, name: str = "P") -> Mdp:
     if isinstance(start, int | np.integer) and 0 <= start < size[0]:
         start = np.eye(size[0])[start]
     return verified(mdp_from_outcomes(name, _outcomes(name, table, *size, start, "start")), name)
-
-
-def _compiled(real: gym.Env[Any, Any], name: str, limit: int | None) -> tuple[Mdp, Outcomes]:
-    table = _table(name, real)
-    known = known_env(real) or _KnownEnv((), lambda env: np.zeros((0, 3), np.int64))
-    (num_states, num_actions), places = table.next_state.shape[:2], known.places(real)
-    mdp = mdp_from_outcomes(
-        name,
-        table,
-        action_names=known.action_names if len(known.action_names) == num_actions else None,
-        places=places if len(places) == num_states else None,
-        panel_names=known.panel_names,
-        max_episode_steps=limit,
-    )
-    is_fickle = known.panel_names and getattr(real, "fickle_passenger", False)
-    if is_fickle and getattr(real, "fickle_probability", 1) > 0:
-        raise InputError(
-            f"{name}: fickle_passenger=True changes the destination in a way that its table P lacks, so it "
-            "cannot be solved exactly; leave it out, or use env=enumerated"
-        )
-    return mdp, table
-
-
-def _table(name: str, real: Any) -> Outcomes:
-    """P and the start distribution as arrays; an outcome that a row does not have has probability 0."""
-    if not has_table(real):
-        raise InputError(f"{name}: has no transition table P with a start distribution")
-    sizes = []
-    for what in ("observation", "action"):
-        space = getattr(real, f"{what}_space", None)
-        if not isinstance(space, gym.spaces.Discrete) or space.start != 0:
-            raise InputError(f"{name}: its {what} space is {space}, must be Discrete(n) that starts at 0")
-        sizes.append(int(space.n))
-    states, actions = sizes
-    return _outcomes(name, real.P, states, actions, _starts(real), "initial_state_distrib")
 
 
 def _outcomes(name: str, table: Any, states: int, actions: int, given: Any, key: str) -> Outcomes:
@@ -153,12 +110,6 @@ def _rows(name: str, table: Any, states: int, actions: int) -> NDArray[np.float6
     )
 
 
-def _differ(table: Outcomes, other: Outcomes) -> bool:
-    names = ("next_state", "probability", "reward", "terminated", "start")
-    tables = ((getattr(table, name), getattr(other, name)) for name in names)
-    return not all(np.array_equal(one, two, equal_nan=True) for one, two in tables)
-
-
 class _KnownEnv(NamedTuple):
     """What is known of a class of environments beside its table; see `Mdp`."""
 
@@ -182,11 +133,3 @@ _KNOWN = {
         tuple(f"{passenger} to {destination}" for passenger in (*"RGYB", "taxi") for destination in "RGYB"),
     ),
 }
-
-
-def known_env(real: Any) -> _KnownEnv | None:
-    """What is known of an environment, if anything is."""
-    for each in type(real).__mro__:
-        if each.__module__.startswith("gymnasium.envs.toy_text."):
-            return _KNOWN.get(each.__name__)
-    return None

@@ -104,7 +104,7 @@ def test_what_can_be_made_here_alone_says_so() -> None:
 
 def test_the_scope_goes_with_the_verdict() -> None:
     lake = compile_id("FrozenLake-v1")
-    assert lake.scope == "by its table P, which its steps follow exactly, in this process"
+    assert lake.scope == "by its table P, which its steps follow exactly"
     policy = np.eye(4)[[1] * lake.num_states]
     score = Evaluator(lake, 0.99, 100).score(policy)
     assert score.scope == lake.scope

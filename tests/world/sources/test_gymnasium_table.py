@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from gridworld import InputError, compile_env
+from gridworld import InputError, compile_env, compile_mdp
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.solver import value_iteration
-from gridworld.world.sources import gymnasium_table
 from gridworld.world.sources.environment import compile_id
-from gridworld.world.sources.gymnasium_table import compile_table
+from gridworld.world.sources.gymnasium_table import has_table
 
 EVERY = {
     "frozen_lake": ("FrozenLake-v1", {"is_slippery": False}, 100),
@@ -56,6 +55,31 @@ def test_every_row_is_that_of_the_table_and_the_step_limit_that_of_the_id(world,
             if not mdp.reachable[state]:  # a step that nobody takes needs no end of its own
                 ours, theirs = ([row[:3] for row in rows] for rows in (ours, theirs))
             assert ours == theirs
+
+
+def outcomes(mdp):
+    """{(number, action): {(number that follows, reward, whether it is over): probability}}."""
+    found = {}
+    for state in np.flatnonzero(mdp.acting).tolist():
+        for action in range(mdp.num_actions):
+            row = found[int(mdp.number[state]), action] = {}
+            each = (table[state, action] for table in (mdp.next_state, mdp.reward, mdp.probability))
+            for following, reward, chance in zip(*each, strict=True):
+                if chance > 0:
+                    key = int(mdp.number[following]), float(reward), bool(mdp.terminal[following])
+                    row[key] = row.get(key, 0.0) + float(chance)
+    return found
+
+
+@pytest.mark.parametrize(
+    "name", ["frozen_lake", "slippery_lake", "cliff_walking", "slippery_cliff", "rainy_taxi"]
+)
+def test_the_table_is_what_a_search_finds(world, name):
+    env_id, kwargs, _ = EVERY[name]
+    table, searched = outcomes(world(name)[0]), outcomes(compile_id(env_id, kwargs, by_table=False))
+    assert table.keys() == searched.keys()
+    for key, row in table.items():
+        assert row == pytest.approx(searched[key], abs=1e-15)
 
 
 def test_a_step_limit_may_be_given():
@@ -122,10 +146,16 @@ class TableEnv(gym.Env):
 
 
 def test_an_environment_of_ones_own_will_do():
-    mdp = compile_table(TableEnv())
+    env = TableEnv()
+    mdp = compile_env(env)
     assert (mdp.name, mdp.action_names, mdp.max_episode_steps) == ("TableEnv", ("0", "1"), None)
+    assert mdp.truth == "enumerated, 3 states"  # with that in which it is over
     assert mdp.places is None
     assert mdp.number.tolist() == [0, 1, 1]
+    by_table = compile_mdp(env.P, env.initial_state_distrib)
+    assert by_table.digest() == compile_mdp(env.P, start=0).digest()
+    for name in ("next_state", "probability", "reward", "terminal", "start", "number"):
+        assert np.array_equal(getattr(by_table, name), getattr(mdp, name)), name
     assert value_iteration(mdp, 0.9).v.tolist() == pytest.approx([0.9, 1.0, 0.0])
 
 
@@ -138,15 +168,28 @@ def redrawn(self, **kwargs):
     ("method", "other", "told"),
     [
         ("reset", redrawn, "a reset does not always lead to the same state"),
-        ("step", lambda self, a: (*TableEnv.step(self, a)[:3], True, {}), "truncates its own episodes"),
-        ("reset", lambda self, **_: (1, {}), "the start in state . occurs with a probability of"),
-        ("step", lambda self, action: 1 / 0, "cannot be stepped .*ZeroDivisionError: division"),
-        ("reset", lambda self, **_: (None, {}), "shows 'None', must show the number of a state"),
+        ("step", lambda self, action: 1 / 0, "a step with action 0 fails: ZeroDivisionError: division"),
+        ("reset", lambda self, **_: (None, {}), "an observation is None, which is not in its space"),
     ],
 )
-def test_an_environment_that_is_not_its_table_is_refused(method, other, told):
+def test_an_environment_with_a_table_that_is_no_world_is_refused(method, other, told):
     with pytest.raises(InputError, match=told):
         compile_env(type("Odd", (TableEnv,), {method: other})())
+
+
+def test_steps_count_and_not_a_table_that_they_do_not_follow():
+    def later(self, **kwargs):
+        TableEnv.reset(self, **kwargs)
+        self.s = 1
+        return 1, {}
+
+    assert compile_env(type("Later", (TableEnv,), {"reset": later})()).start.tolist() == [0.0, 1.0, 0.0]
+    env = TableEnv()
+    env.step = lambda action: (0, 1.0, False, False, {})
+    assert compile_env(env).reward.tolist() == [[[1.0], [1.0]], [[0.0], [0.0]]]
+    lake = gym.make("FrozenLake-v1").unwrapped
+    other = type("Other", (type(lake),), {"step": lambda self, action: type(lake).step(self, 3 - action)})()
+    assert compile_env(other).truth.startswith("enumerated")
 
 
 def test_the_wrappers_of_an_id_belong_to_its_world():
@@ -171,21 +214,13 @@ def test_the_wrappers_of_an_id_belong_to_its_world():
         assert judge.optimal_value == pytest.approx(0.9 ** (steps - 1) if reward > 0 else 0.0)
 
 
-def test_a_replaced_step_is_refused():
-    env = TableEnv()
-    env.step = lambda action: (0, 1.0, False, False, {})
-    with pytest.raises(InputError, match="TableEnv: does not follow its own table: P"):
-        compile_table(env)
-
-
 ROW = [(1.0, 0, 0.0, False)]
 
 
 @pytest.mark.parametrize(
     ("changed", "told"),
     [
-        ({"P": None}, "has no transition table P with a start"),
-        ({"P": {0: {0: ROW, 1: ROW}}}, "P must have for each of 2 states and 2 actions a list"),
+        ({"P": {0: {0: ROW, 1: ROW}, 2: {0: ROW, 1: ROW}}}, "P must have for each of 2 states and 2 actions"),
         ({"P": [[ROW, ROW], [ROW]]}, "P must have"),
         ({"P": [[ROW, ROW], [ROW, []]]}, "P must have"),
         ({"P": [[ROW, ROW], [ROW, [(1.0, 0, 0.0)]]]}, "P must have"),
@@ -194,18 +229,17 @@ ROW = [(1.0, 0, 0.0, False)]
         ({"P": [[ROW, ROW], [ROW, [(1.0, 0, 0.0, None)]]]}, "P must have"),
         ({"P": [[ROW, ROW], [ROW, [(0.5, 0, 0.0, False)]]]}, "probability of state 1, action 1"),
         ({"P": [[ROW, ROW], [ROW, [(1.0, 0, float("nan"), False)]]]}, "reward of state 1, action 1"),
-        ({"initial_state_distrib": [1.0]}, "initial_state_distrib must be the 2 probabilities"),
-        ({"initial_state_distrib": None}, "has no transition table P with a start"),
-        ({"observation_space": spaces.Box(0, 1)}, "its observation space is Box"),
-        ({"action_space": spaces.Discrete(2, start=1)}, "its action space is Discrete"),
-        ({"observation_space": spaces.Discrete(10**6)}, "1,000,000 states and 2 actions are too many"),
+        ({"start": [1.0]}, "start must be the 2 probabilities"),
+        ({"start": None}, "start must be the 2 probabilities"),
+        ({"start": 2}, "start must be the 2 probabilities"),
+        ({"P": {}}, "start must be the 0 probabilities"),
+        ({"P": [[ROW]] * 10**6}, "1,000,000 states and 1 actions are too many"),
     ],
 )
 def test_a_table_that_is_none_is_refused(changed, told):
-    env = TableEnv()
-    vars(env).update(changed)
-    with pytest.raises(InputError, match=f"^TableEnv: .*{told}"):
-        compile_table(env)
+    given = {"P": TableEnv().P, "start": [1.0, 0.0]} | changed
+    with pytest.raises(InputError, match=f"^P: .*{told}"):
+        compile_mdp(given["P"], given["start"])
 
 
 @pytest.mark.parametrize(
@@ -227,7 +261,6 @@ def test_a_table_that_is_none_is_refused(changed, told):
         ("FrozenLake-v1", {"map_name": "9x9"}, "env.kwargs={map_name: 9x9}: FrozenLake-v1 cannot be made"),
         ("FrozenLake-v1", {"map_name": None}, "a different table each time it is made"),
         ("FrozenLake-v1", {"desc": ["FF", "FG"]}, "start is .*must be probabilities"),
-        ("Taxi-v4", {"fickle_passenger": True}, "Taxi-v4: fickle_passenger=True changes the destination"),
         ("Taxi-v4", {"render_mode": "human"}, "env.kwargs: render_mode=human is not part"),
     ],
 )
@@ -249,10 +282,10 @@ def test_an_id_may_name_the_module_that_registers_it(tmp_path, monkeypatch):
     del gym.registry["Lake-v7"]
 
 
-def test_a_walk_alone_finds_a_fickle_passenger(monkeypatch):
-    monkeypatch.setattr(gymnasium_table, "known_env", lambda env: None)
-    with pytest.raises(InputError, match=r"(its own table: P|step that is repeated)"):
-        compile_id("Taxi-v4", {"fickle_passenger": True})
+def test_a_table_that_lacks_something_is_left_out():
+    assert [
+        has_table(gym.make("Taxi-v4", fickle_passenger=fickle).unwrapped) for fickle in (False, True)
+    ] == [True, False]
 
 
 def test_the_environment_is_left_as_it_is():
