@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import enum
 import functools
 import hashlib
 import inspect
 import pickle
 import random
 import sys
-from collections.abc import Iterator
+import types
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+_LIBRARIES = ("gymnasium", "numpy", "pygame", "stable_baselines3", "torch", "gridworld")
+_DEEP = 4  # lists in lists
+_NOT_PLAIN = (
+    *(type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types.MethodType, property),
+    *(classmethod, staticmethod, enum.Enum, gym.Env, gym.Space, np.ndarray, functools.partial),
+)
 GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
 
 
@@ -95,3 +103,29 @@ def state_of(generator: Any) -> bytes:
 def kind_of(thing: Any) -> Any:
     """Its class, of which nothing is known."""
     return type(thing)
+
+
+def shared_with(kinds: Iterable[type]) -> list[Any]:
+    """The plain objects that classes and their modules hold by a name, or in a list or dictionary.
+
+    Code may ask of an attribute whether it is one of them.
+    """
+    own = [each for each in kinds if not _is_library(each.__module__)]
+    modules = dict.fromkeys(sys.modules[each.__module__] for each in own if each.__module__ in sys.modules)
+    waiting: list[Any] = [list(vars(each).values()) for each in (*own, *modules)]
+    found: dict[int, Any] = {}
+    for depth in range(_DEEP):
+        inner: list[Any] = []
+        for held in waiting:
+            for each in held.values() if isinstance(held, dict) else held:
+                if type(each) in (list, tuple, dict, set, frozenset):
+                    inner.append(each)
+                elif type(each) is object or (hasattr(each, "__dict__") and not isinstance(each, _NOT_PLAIN)):
+                    found[id(each)] = each
+        waiting = inner if depth + 1 < _DEEP else []
+    return list(found.values())
+
+
+def _is_library(name: str) -> bool:
+    root = name.partition(".")[0]
+    return (root in sys.stdlib_module_names and root != "__main__") or root in _LIBRARIES

@@ -34,6 +34,8 @@ class Copier(pickle.Pickler):
         if obj is _kept:
             return NotImplemented
         key = id(obj) if id(obj) in self._known else None
+        if key in self._held.shared:
+            self._held.met_shared.add(key)
         if key is None and type(obj) not in self._held.ordinary:
             key = self._held.reference(obj)
         return (_kept, (key,)) if key is not None else self._taken_apart(obj)
@@ -60,6 +62,8 @@ class SharedCopier(Copier):
         if kind in ATOMS or obj is _kept:
             return None
         if (key := id(obj)) in self._known:
+            if key in self._held.shared:
+                self._held.met_shared.add(key)
             return key
         return None if kind in self._held.ordinary else self._held.reference(obj)
 

@@ -10,6 +10,7 @@ the one that takes every outcome. The environment gets back its own attributes i
 from __future__ import annotations
 
 import collections
+import contextlib
 import io
 import itertools
 import math
@@ -32,11 +33,12 @@ from gridworld.world.door.attributes import (
     own_spaces,
     random_states,
     set_attributes,
+    shared_with,
     spaces_in,
     state_of,
 )
 from gridworld.world.door.copies import ATOMS, Copier, Reader, Recorder, SharedCopier
-from gridworld.world.door.stand_ins import Limited, Recorded
+from gridworld.world.door.stand_ins import Limited, Recorded, Timed
 from gridworld.world.door.uniform import Uniform
 
 Env = gym.Env[Any, Any]
@@ -57,6 +59,10 @@ class Changed(Exception):  # noqa: N818
         self.found = found
 
 
+class SharedChanged(Exception):  # noqa: N818
+    """An object that its modules or classes hold has changed, so that it is state, which is copied."""
+
+
 class Layers:
     """The layers of an environment, the outermost first, and copies of what they hold.
 
@@ -65,9 +71,12 @@ class Layers:
         env: it is changed, and left as it was by `restored`.
         branching: the generator in place of every other.
         counts_time: whether the count of a `TimeLimit` is state too, since something reads it.
+        keeps_shared: whether objects that its modules and classes hold are kept as they are.
     """
 
-    def __init__(self, where: str, env: Env, branching: Any, counts_time: bool = False) -> None:
+    def __init__(
+        self, where: str, env: Env, branching: Any, counts_time: bool = False, keeps_shared: bool = True
+    ) -> None:
         self._where, self.branching = where, branching
         self.limit: int | None = None
         self.layers: list[Any] = []
@@ -78,7 +87,9 @@ class Layers:
                 most = int(vars(layer)["_max_episode_steps"])
                 if most > 0:  # -1 is "none" to `gymnasium.make`
                     self.limit = most if self.limit is None else min(self.limit, most)
-                if self.limited is None and self.layers:
+                if self.limited is not None:
+                    raise Timed  # one of two below a wrapper may be a count of other steps
+                if self.layers:
                     self.limited = Limited(layer.env)
                     chain.append(self.limited)
             elif not known.is_neutral(layer):
@@ -90,7 +101,10 @@ class Layers:
         self.may_see_cuts = self.limited is not None and not all(map(known.steps_once, self.layers[:-1]))
         self.env: Any = self.layers[0]
         self.base: Any = self.layers[-1]
-        self.fixed: dict[Any, Any] = {id(each): each for each in (*chain, branching)}
+        kinds = {kind: None for layer in self.layers for kind in type(layer).__mro__ if keeps_shared}
+        self.shared = {id(each): each for each in shared_with(kinds)}  # kept as they are
+        self.met_shared = set[int]()
+        self.fixed: dict[Any, Any] = {id(each): each for each in (*chain, branching)} | self.shared
         self._known = self.fixed  # and what is within attributes that are left in place
         self._shares = False  # whether lists and dictionaries are among these
         self._left: list[list[tuple[str, Any]]] = [[] for _ in self.layers]  # in place, by layers
@@ -105,7 +119,8 @@ class Layers:
         before = [(layer, attributes(layer)) for layer in self.layers]
         values = [each for layer, held in before for each in (*held.values(), *own_spaces(layer))]
         spaces = {id(space): (space, vars(space).get("_np_random")) for space in spaces_in(values)}.values()
-        self._shared = random_states()
+        self._random = random_states()
+        self._shared_before = self._shared_content()
         try:
             self._adopt()
             for space, _ in spaces:
@@ -115,12 +130,14 @@ class Layers:
         finally:
             for layer, held in before:
                 set_attributes(layer, held)
+            for key in self._changed_shared():
+                set_attributes(self.shared[key], self._load(self._shared_before[key]))
             for space, generator in spaces:
                 vars(space)["_np_random"] = generator
 
     def check_generators(self) -> None:
         """Refuse draws from generators that cannot be replaced."""
-        if random_states() != self._shared or any(
+        if random_states() != self._random or any(
             state_of(each) != state for each, state in self._generators
         ):
             raise InputError(
@@ -133,6 +150,7 @@ class Layers:
         """Put copies in place of everything, and the generator that branches in place of every other."""
         self.is_adopting = True
         held = [attributes(layer) for layer in self.layers]
+        self._check_closures(held)
         try:
             copy = self._load(self._dump([list(each.items()) for each in held]))
         except Exception as error:
@@ -147,6 +165,26 @@ class Layers:
             self.base._np_random = self.branching
         if getattr(self.base, "render_mode", None) == "human":
             self.base.render_mode = None
+
+    def _check_closures(self, held: list[dict[str, Any]]) -> None:
+        """Refuse a function that holds an object which an attribute holds too, and which has copies here."""
+        cells = [
+            (name, cell.cell_contents)
+            for each in held
+            for name, value in each.items()
+            if isinstance(value, types.FunctionType)
+            for cell in value.__closure__ or ()
+            if not isinstance(cell.cell_contents, gym.Env)
+        ]
+        recorder = Recorder(self)
+        with contextlib.suppress(Exception):  # which copying raises again
+            recorder.dump(held if cells else None)
+        met = {id(each) for each in recorder.met}
+        if shared := next((name for name, content in cells if id(content) in met), None):
+            raise InputError(
+                f"{self._where}: its attribute {shared} is a function that holds an object of another "
+                "attribute; make it a method"
+            )
 
     def _uncopied(self, held: list[dict[str, Any]], error: Exception) -> InputError:
         if isinstance(error, InputError):
@@ -199,10 +237,16 @@ class Layers:
     def _content_left(self) -> bytes:
         return self._dump([[value for _, value in left] for left in self._left], self.fixed)
 
+    def changed_left(self) -> list[tuple[int, str]]:
+        """All that was left in place, if some of it has changed after all."""
+        if self._content_left() == self._digest_left:
+            return []
+        return [(number, name) for number, left in enumerate(self._left) for name, _ in left]
+
     def check_left(self) -> None:
-        """Raise `Changed` if what was left in place has changed after all."""
-        if self._content_left() != self._digest_left:
-            raise Changed([(number, name) for number, left in enumerate(self._left) for name, _ in left])
+        """Raise `Changed` if what was left in place has changed."""
+        if found := self.changed_left():
+            raise Changed(found)
 
     def take(self, without: Sequence[str] = ()) -> bytes:
         """A copy of the state. Equal copies are of equal states; equal states may have several."""
@@ -224,6 +268,25 @@ class Layers:
         for layer, items, left in zip(self.layers, self._load(copy), self._left, strict=True):
             set_attributes(layer, dict(items + left))
 
+    def check_shared(self) -> None:
+        """Raise `SharedChanged` if an object that is kept for its modules and classes has changed."""
+        if self._changed_shared():
+            raise SharedChanged
+
+    def _shared_content(self) -> dict[int, bytes]:
+        """What each of these objects holds, by their ids; without those that cannot be copied."""
+        found, met = {}, self.met_shared.copy()
+        for each in self.shared.values():
+            with contextlib.suppress(Exception):  # of anybody's
+                found[id(each)] = self._dump(attributes(each), self.fixed)
+        self.met_shared = met  # without what they hold of each other
+        return found
+
+    def _changed_shared(self) -> list[int]:
+        """Those that an attribute was, and that hold something else than before."""
+        now, met = self._shared_content(), self.met_shared
+        return [key for key, content in self._shared_before.items() if key in met and now.get(key) != content]
+
     def everything(self, *more: Any) -> bytes:
         """A copy of every attribute, and of `more`; what cannot be copied raises whatever it raises."""
         return self._dump([*more, *(attributes(layer) for layer in self.layers)], self.fixed)
@@ -238,11 +301,16 @@ class Layers:
 
     def values(self, ignore: Sequence[str] = ()) -> dict[tuple[int, str], bytes]:
         """A copy of each attribute that is not left in place, by the number of its layer and its name."""
-        return {
-            (number, name): self._dump(value)
-            for number, items in enumerate(self._held(ignore))
-            for name, value in items
-        }
+        found = {}
+        for number, items in enumerate(self._held(ignore)):
+            for name, value in items:
+                try:
+                    found[number, name] = self._dump(value)
+                except (InputError, Timed):
+                    raise
+                except Exception as error:  # whatever the classes in it raise
+                    raise self._uncopied([{name: value}], error) from error
+        return found
 
     def _dump(self, thing: Any, known_objects: dict[Any, Any] | None = None) -> bytes:
         buffer = io.BytesIO()

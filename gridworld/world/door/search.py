@@ -26,17 +26,18 @@ from gridworld.world.door import known
 from gridworld.world.door.beliefs import Step, lumped
 from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES, SAMPLED, Budget
 from gridworld.world.door.clock import watched
-from gridworld.world.door.layers import Changed, Env, Layers
+from gridworld.world.door.episodes import check_by_episodes, check_by_word
+from gridworld.world.door.layers import Changed, Env, Layers, SharedChanged
 from gridworld.world.door.observations import leaves
 from gridworld.world.door.rejection import Rejecting
 from gridworld.world.door.resets import Resets
 from gridworld.world.door.stand_ins import Limited, Timed
 from gridworld.world.door.walks import walk
-from gridworld.world.door.word import check_by_word
 from gridworld.world.outcomes import MOST_ACTIONS
 
 OVER = -1  # in place of the state in which an episode ends
 _BEYOND = 1_000  # states further than a step limit that are found too, so that a small world is whole
+_BATCH = 1_000  # states that are tried before a reset is tried from each of them
 _DEEPEST = 10_000  # steps from the start
 _FEW_STARTS = 256  # of more, every outcome of a reset is tried from the first and the last state only
 _LONGEST_NAME = 60  # of a state that is called by its observation
@@ -102,8 +103,13 @@ class Search:
                 f"its actions are {actions}, must be Discrete(n), from 0 to {MOST_ACTIONS} - 1"
             )
         self.num_actions = int(actions.n)
-        self.has_masks = isinstance(env, gym.Wrapper) and env.has_wrapper_attr("action_masks")
-        self.has_masks = self.has_masks or hasattr(env, "action_masks")
+        try:
+            self.has_masks = isinstance(env, gym.Wrapper) and env.has_wrapper_attr("action_masks")
+            self.has_masks = self.has_masks or hasattr(env, "action_masks")
+        except Exception as error:  # of its own
+            raise self.refusal(
+                f"its __getattr__ raises {in_short(error)}, must raise AttributeError"
+            ) from error
         self.observations: dict[bytes, Any] = {}  # by their digests
         self.shown: dict[bytes, str] = {}  # the same as short texts
         self.limit_met: int | None = None  # the time at which it cuts episodes, where the time is no state
@@ -115,22 +121,31 @@ class Search:
 
     def explore(self) -> None:
         """Find all states that can be reached, and what every action does there."""
+        counts_time, keeps_shared, is_done = False, True, False
         with watched() as self.clock_readers:
-            try:
-                self._explored(counts_time=False)
-            except (_Missing, Timed):  # something reads what is around it: a time limit's count, say
-                self._explored(counts_time=True)
+            while not is_done:
+                try:
+                    self._explored(counts_time, keeps_shared)
+                    is_done = True
+                except SharedChanged:
+                    keeps_shared = False
+                except (_Missing, Timed):  # something reads what is around it: a time limit's count, say
+                    counts_time = True
 
-    def _explored(self, counts_time: bool) -> None:
+    def _explored(self, counts_time: bool, keeps_shared: bool) -> None:
         runs = (Search.reset_from.__code__, Search.stepped_from.__code__)
         self.branching = Rejecting(self.where, self._everything, runs, self._read is not None, self._compares)
-        self.layers = layers = Layers(self.where, self.env, self.branching, counts_time)
+        self.layers = layers = Layers(self.where, self.env, self.branching, counts_time, keeps_shared)
         self._is_complete = counts_time  # nothing that an environment may read is left out
         with layers.restored():
             begin, before = layers.take(), layers.values()
-            as_sent = walk(self, np.int64)
-            after = layers.values()
-            changing = {each for each in before | after if before.get(each) != after.get(each)}
+            changing: set[tuple[int, str]] = set()
+
+            def look() -> None:
+                after = layers.values()
+                changing.update(each for each in before | after if before.get(each) != after.get(each))
+
+            as_sent = walk(self, np.int64, look)
             for kind, mistake in ((np.int64, _NOT_REPEATED), (int, _INTS)):
                 layers.put(begin)
                 if walk(self, kind) != as_sent:
@@ -142,21 +157,29 @@ class Search:
                 try:
                     self._explore(layers.limit)
                     layers.check_left()
+                    layers.check_shared()
                     if self.ignore or self._read is not None:
                         self.limit_met = check_by_word(self)
+                    else:
+                        check_by_episodes(self)
                     layers.check_generators()
                     return
                 except Changed as error:
-                    changing |= set(error.found)
-                    layers.leave_nothing()
+                    found = error.found
                 except InputError as error:
                     layers.check_generators()  # which names a cause that others follow from
-                    space = self.env.observation_space
-                    is_continuous = isinstance(space, spaces.Box) and space.dtype.kind == "f"
-                    if is_continuous and "more than comparisons" in str(error):
-                        continuous = "its states are continuous, and only finite worlds have an exact optimum"
-                        raise self.refusal(f"{continuous} ({str(error).partition(': ')[2]})") from None
-                    raise
+                    if not (found := layers.changed_left()):
+                        raise self._explained(error) from None
+                changing |= set(found)
+                layers.leave_nothing()
+
+    def _explained(self, error: InputError) -> InputError:
+        space = self.env.observation_space
+        is_continuous = isinstance(space, spaces.Box) and space.dtype.kind == "f"
+        if not (is_continuous and "more than comparisons" in str(error)):
+            return error
+        continuous = "its states are continuous, and only finite worlds have an exact optimum"
+        return self.refusal(f"{continuous} ({str(error).partition(': ')[2]})")
 
     def _everything(self, *held: Any) -> bytes:
         """All that a step's rest depends on, with what the functions between hold."""
@@ -188,7 +211,7 @@ class Search:
         self.open(each.following for each in self.resets.starts)
         waiting = self._waiting
         beyond: int | None = None  # where in `waiting` the limit is, with `size` states before it
-        size = 0
+        size = checked = 0  # of the states in `waiting`, those from which a reset was tried
         for place, state in enumerate(waiting):  # which grows
             budget.show(f"{len(self.states):,} states, {place:,} of them tried")
             if beyond is None and state.depth >= (limit or _DEEPEST):
@@ -200,15 +223,19 @@ class Search:
             try:
                 budget.most_now = most_states
                 state.steps = self._tried(state)
+                steps = itertools.chain.from_iterable(state.steps)
+                self.open(each.following for each in steps if not (each.terminated or each.truncated))
+                if place + 1 == len(waiting) or place + 1 - checked >= _BATCH:
+                    self._check_resets(waiting[checked : place + 1])
+                    checked = place + 1
             except InputError:
                 if beyond is None:
                     raise
                 for late in waiting[beyond:]:
                     late.steps = ()
                 del self.states[size:]
+                self._check_resets(waiting[checked:beyond])
                 break
-            steps = itertools.chain.from_iterable(state.steps)
-            self.open(each.following for each in steps if not (each.terminated or each.truncated))
         self.resets.check(next(each.copy for each in reversed(self.states) if each.copy))
         apart = [(each.mask, each.place) for each in self.states]
         self.classes = lumped([each.steps for each in self.states], apart)
@@ -282,18 +309,27 @@ class Search:
             self.layers.put(state.copy)
             if self._mask() != state.mask:
                 raise self.refusal("its action_masks() does not always allow the same in the same state")
-        if is_marked := state.number.bit_count() <= 1:  # 0, 1, 2, 4, 8 ...
+        if state.number.bit_count() <= 1:  # 0, 1, 2, 4, 8 ...
             self.layers.check_left()
-        if is_marked and (len(self.resets.starts) <= _FEW_STARTS or not state.number):
-            self.resets.check(state.copy)
-        else:
-            self.resets.check_first(state.copy)
+        return steps
+
+    def _check_resets(self, states: Sequence[State]) -> None:
+        """A reset from these states, and from the ends that were met, must lead to the same.
+
+        After their steps, for a reset may put back what these have changed in place.
+        """
+        self.layers.check_left()
+        for state in states:
+            is_marked = state.number.bit_count() <= 1
+            if is_marked and (len(self.resets.starts) <= _FEW_STARTS or not state.number):
+                self.resets.check(state.copy)
+            else:
+                self.resets.check_first(state.copy)
+            if state.number % SAMPLED:
+                self.budget.num_bytes -= len(state.copy)
+                state.copy = b""
         while self._waiting_ends:
             self.resets.check_first(self._waiting_ends.pop())
-        if state.number % SAMPLED:
-            self.budget.num_bytes -= len(state.copy)
-            state.copy = b""
-        return steps
 
     def merged(self, run: Callable[[], Result]) -> list[Step]:
         """The outcomes of a reset or a step."""

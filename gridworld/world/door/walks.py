@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,23 +13,29 @@ if TYPE_CHECKING:
 _WALKS, _WALK = 20, 10  # walks, and the steps of each
 
 
-def walk(search: Search, kind: type) -> list[Any]:
-    """What some walks with numpy's own generator and actions of a type show."""
-    numbers, shown = np.random.default_rng(0), list[Any]()
+def walk(search: Search, kind: type, look: Callable[[], None] = lambda: None) -> list[Any]:
+    """What some walks with numpy's own generator and actions of a type show; `look` is called after each."""
+    numbers, shown, fails = np.random.default_rng(0), list[Any](), False
     search.branching.sampling = np.random.default_rng(1)
     try:
         for _ in range(_WALKS):
-            shown.append(search.see(search.layers.env.reset()[0]))
-            for _ in range(_WALK):
-                observation, reward, *over, _ = search.layers.env.step(
-                    kind(numbers.integers(search.num_actions))
-                )
-                paid = np.asarray(reward, np.float64).tobytes()
-                shown += [search.see(observation), paid, *map(bool, over)]
-                if any(over):
-                    break
-    except Exception as error:  # which the search meets too, and refuses
-        shown.append(str(error))
+            try:
+                shown += _steps(search, kind, numbers)
+            except Exception as error:  # which the search meets too, and refuses
+                shown.append(str(error))
+                fails = True
+            look()
+            if fails:
+                break
     finally:
         search.branching.sampling = None
     return shown
+
+
+def _steps(search: Search, kind: type, numbers: np.random.Generator) -> Iterator[Any]:
+    yield search.see(search.layers.env.reset()[0])
+    for _ in range(_WALK):
+        observation, reward, *over, _ = search.layers.env.step(kind(numbers.integers(search.num_actions)))
+        yield search.see(observation), np.asarray(reward, np.float64).tobytes(), *map(bool, over)
+        if any(over):
+            return

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from gridworld.base.user_input import check_memory
 from gridworld.world.door.beliefs import Beliefs, Node
 from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES
+from gridworld.world.door.episodes import NO_LIMIT
 from gridworld.world.door.layers import Env
 from gridworld.world.door.search import Named, Search, State
-from gridworld.world.door.word import NO_LIMIT
 from gridworld.world.mdp import ENUMERATED, Mdp, taken
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.shown import of_learners, stacked

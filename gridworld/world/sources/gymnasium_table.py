@@ -48,13 +48,11 @@ def compile_table(real: gym.Env[Any, Any], limit: int | None = None, name: str |
 def has_table(env: Any) -> bool:
     """Whether an environment is one of Gymnasium's own that steps by its table."""
     kind = type(env)
+    if not kind.__module__.startswith("gymnasium.envs.toy_text.") or kind.__name__ not in _KNOWN:
+        return False
     is_fickle = getattr(env, "fickle_passenger", False) and getattr(env, "fickle_probability", 1) > 0
-    return (
-        kind.__module__.startswith("gymnasium.envs.toy_text.")
-        and kind.__name__ in _KNOWN
-        and not {"step", "reset"} & vars(env).keys()
-        and not is_fickle  # which its table lacks
-    )
+    is_own = {kind.step.__module__, kind.reset.__module__} != {kind.__module__}
+    return not (is_own or is_fickle or {"step", "reset"} & vars(env).keys())  # which its table lacks
 
 
 def mdp_of_table(table: Any, start: Any, name: str = "P") -> Mdp:

@@ -1,5 +1,6 @@
 """Environments as people have them become exact worlds: wrappers, memory, Dicts, clocks, batches, classes."""
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -595,3 +596,165 @@ def test_beliefs_without_end_end_at_the_step_limit(limit: int) -> None:
     for _ in range(limit):
         value = backup(mdp, value, 1.0).max(axis=1)
     assert value @ mdp.start == pytest.approx(best(limit, 0), abs=1e-9)
+
+
+# ---- what is not copied ----------------------------------------------------------------------------------
+
+
+class Tile:
+    """A kind of cell, which is compared by identity."""
+
+    def __init__(self, pays: float) -> None:
+        self.pays = pays
+
+
+EMPTY, COIN, NOTHING = Tile(0.0), Tile(1.0), object()
+HELD: dict[str, Any] = {}
+
+
+class Coins(gym.Env[int, int]):
+    """Three cells in a row; who takes what is in a cell leaves it empty."""
+
+    observation_space, action_space = spaces.Discrete(3), spaces.Discrete(2)
+    taken: list[int] = []  # noqa: RUF012
+    size = 3
+
+    def __init__(self) -> None:
+        self.cells: Any = [EMPTY, EMPTY, COIN]
+
+    def pay(self) -> float:
+        cell, self.cells[self.at] = self.cells[self.at], EMPTY
+        return float(cell is COIN)
+
+    def begin(self) -> None:
+        self.cells = [EMPTY, EMPTY, COIN]
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.at = 0
+        self.begin()
+        return 0, {}
+
+    def step(self, action: int) -> Any:
+        self.at = min(self.at + int(action), self.size - 1)
+        pays = self.pay() if action == 0 else 0.0
+        return self.at, pays, pays > 0, False, {}
+
+
+class Sentinel(Coins):
+    """The coin is what is not the one object of its module."""
+
+    def begin(self) -> None:
+        self.cells = [NOTHING, NOTHING, "coin"]
+
+    def pay(self) -> float:
+        cell, self.cells[self.at] = self.cells[self.at], NOTHING
+        return float(cell is not NOTHING)
+
+
+class Grid(Coins):
+    """A large array, changed in place, which a reset puts back in place; the coin is far away."""
+
+    observation_space, size = spaces.Discrete(40), 40
+
+    def __init__(self) -> None:
+        self.template = np.zeros((40, 40))
+        self.template[0, 25:27] = -1, 1  # where a fine is left over that is paid once
+        self.grid = self.template.copy()
+
+    def begin(self) -> None:
+        self.grid[:] = self.template
+
+    def pay(self) -> float:
+        pays, self.grid[0, self.at] = self.grid[0, self.at], 0
+        return float(pays)
+
+
+class InClass(Coins):
+    def begin(self) -> None:
+        type(self).taken.clear()
+
+    def pay(self) -> float:
+        is_new = self.at == 2 and not self.taken
+        type(self).taken.append(self.at)
+        return float(is_new)
+
+
+class InModule(Coins):
+    def begin(self) -> None:
+        HELD.clear()
+
+    def pay(self) -> float:
+        first = HELD.setdefault("at", self.at)
+        return float(self.at == first == 2)
+
+
+class InClosure(Coins):
+    def __init__(self) -> None:
+        taken = [0]
+        self.taken, self.has_taken = taken, lambda: taken[0]
+
+    def begin(self) -> None:
+        self.taken[0] = 0
+
+    def pay(self) -> float:
+        before, self.taken[0] = self.has_taken(), 1
+        return float(self.at == 2 and not before)
+
+
+@pytest.mark.parametrize("make", [Coins, Sentinel, Grid])
+def test_objects_of_its_module_and_large_arrays(make: Callable[[], Any]) -> None:
+    env = make()
+    steps = 26 if make is Grid else 2
+    assert optimum(env) == pytest.approx(0.99**steps, abs=1e-12)
+    before = EMPTY.pays, COIN.pays
+    assert gridworld.compile_env(make).num_states >= 3
+    assert (EMPTY.pays, COIN.pays) == before
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (InClass, "none of the outcomes that it has from a copy of its state, so it depends on more"),
+        (InModule, "none of the outcomes that it has from a copy of its state, so it depends on more"),
+        (InClosure, "its attribute has_taken is a function that holds an object of another attribute"),
+    ],
+)
+def test_what_it_keeps_elsewhere_is_met_in_episodes(make: Callable[[], Any], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        gridworld.compile_env(make())
+
+
+class Skipping(gym.Wrapper[int, int, int, int]):
+    def step(self, action: int) -> Any:
+        self.env.step(action)
+        return self.env.step(action)
+
+
+class Passing(gym.Wrapper[int, int, int, int]):
+    def step(self, action: int) -> Any:
+        return self.env.step(action)
+
+
+class Raising(Coins):
+    def __getattr__(self, name: str) -> Any:
+        return HELD[name]
+
+
+class Locking(Coins):
+    def begin(self) -> None:
+        self.lock = threading.Lock()
+
+
+def test_two_limits_around_a_wrapper_that_skips() -> None:
+    env = Passing(wrappers.TimeLimit(Skipping(wrappers.TimeLimit(Coins(), 4)), 4))
+    assert gridworld.compile_env(env).max_episode_steps == 2
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [(Raising, "__getattr__ raises KeyError"), (Locking, "its attribute lock cannot be copied")],
+)
+def test_what_cannot_be_asked_or_copied_is_refused(make: Callable[[], Any], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        gridworld.compile_env(make())

@@ -1,7 +1,12 @@
-"""What a user leaves out of the state must not matter: episodes played beside what was found without it."""
+"""Episodes with numpy's own generator, played next to what was found: each step must be one of its outcomes.
+
+What a step does from a copy of the state may be another thing than what it does in an episode: where it
+depends on what is not copied, or on what a user leaves out of the state.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -13,7 +18,14 @@ if TYPE_CHECKING:
     from gridworld.world.door.search import Search
 
 NO_LIMIT = "it truncates some episodes earlier than others, so it has no single step limit"
+_MORE = (
+    "so it depends on more than its attributes: on what its class, its module, a function or a file holds, "
+    "or on which object an attribute is"
+)
+_LONG_SHARE = 0.1  # of the episodes
+_LIVELY = 0.7  # how often an action is taken that does not end the episode, if there is any
 _STEPS, _EPISODES = 3_000, 8  # at least
+_FEW, _EACH = 200, 5  # steps at least, and for each state and action, up to _STEPS, where nothing is left out
 _LONGEST, _LONG = 10_000, 300  # steps of the first of them, and of others before any action is taken
 
 
@@ -33,6 +45,47 @@ def check_by_word(search: Search) -> int | None:
     finally:
         search.branching.sampling = None
     return limit
+
+
+def check_by_episodes(search: Search) -> None:
+    """Play; of the states that what was shown so far leaves possible, one must lead to what is shown next."""
+    numbers, size = np.random.default_rng(0), len(search.states)
+    left = min(_STEPS, max(_FEW, _EACH * size * search.num_actions))
+    short = min(_LONG, 2 * max(each.depth for each in search.states) + 4)
+    search.branching.sampling = np.random.default_rng(2)
+    try:
+        while left > 0:
+            search.layers.put(search.first)
+            seen = search.see(search.layers.env.reset()[0])
+            possible = {each.following for each in search.resets.starts if each.seen == seen}
+            if not possible:
+                raise search.refusal(f"a reset shows what was not enumerated, {_MORE}")
+            lives = int(numbers.integers(1, _LONG if numbers.random() < _LONG_SHARE else short))
+            for took in range(1, lives + 1):
+                rows = [search.states[each].steps if each < size else () for each in possible]
+                if not all(rows):
+                    break  # beyond the step limit
+                ending = {
+                    a for row in rows for a, steps in enumerate(row) if any(s.terminated for s in steps)
+                }
+                living = [a for a in range(search.num_actions) if a not in ending]
+                choice = living if living and numbers.random() < _LIVELY else range(search.num_actions)
+                action = choice[int(numbers.integers(len(choice)))]
+                observation, reward, terminated, truncated, _ = search.layers.env.step(np.int64(action))
+                found = search.see(observation), float(reward), bool(terminated)
+                steps = itertools.chain.from_iterable(row[action] for row in rows)
+                possible = {s.following for s in steps if (s.seen, s.reward, s.terminated) == found}
+                left -= 1
+                if not possible:
+                    raise search.refusal(
+                        f"step {took} of an episode is none of the outcomes that it has from a copy of its "
+                        f"state, {_MORE}"
+                    )
+                if terminated or truncated:
+                    break
+            left -= 1
+    finally:
+        search.branching.sampling = None
 
 
 def _episode(search: Search, numbers: np.random.Generator, lives: int) -> tuple[int, bool]:
