@@ -15,7 +15,8 @@ MOST_STATES, MOST_SECONDS = 200_000, 120.0
 _MOST_BYTES = 2**31  # of all copies and observations together
 SAMPLED = 16  # of so many states the copy of one is kept, to name what keeps changing
 _MOST_SAMPLES = 1_000
-_BETWEEN_LOOKS, _BETWEEN_LINES, _SLOW = 0.5, 3.0, 6.0  # seconds: of progress on a terminal, and elsewhere
+_FIRST, _SLOW = 1.0, 6.0  # seconds after which progress is shown, and what keeps growing
+_BETWEEN_LOOKS, _BETWEEN_LINES = 0.5, 3.0  # seconds: of progress on a terminal, and elsewhere
 
 
 class Budget:
@@ -24,8 +25,9 @@ class Budget:
     def __init__(self, search: Search, most_states: int, most_seconds: float) -> None:
         self._search, self.most_states, self._most_seconds = search, most_states, most_seconds
         self._began = time.monotonic()
-        self._line, self._due = ProgressLine(enabled=True, seconds_between_lines=_BETWEEN_LINES), 1.0
+        self._line, self._due = ProgressLine(enabled=True, seconds_between_lines=_BETWEEN_LINES), _FIRST
         self._growing = ""
+        self.is_explored = False  # then its environment is as it was, and not to be touched
         self.begin()
 
     def begin(self) -> None:
@@ -62,7 +64,7 @@ class Budget:
         seconds = time.monotonic() - self._began
         if seconds >= self._due:
             self._due = seconds + _BETWEEN_LOOKS
-            if seconds > _SLOW and not self._growing:
+            if seconds > _SLOW and not (self._growing or self.is_explored):
                 self._growing = f"; {self._most_values()} keeps changing"
             where = self._search.where
             self._line.show(lambda: f"{where}: {what}, {seconds:.0f} s{self._growing}; Ctrl-C ends it")

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 _NAMES = ("time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns")
@@ -25,9 +26,14 @@ def watched() -> Iterator[set[str]]:
 
     def watching(read: Callable[[], Any]) -> Callable[[], Any]:
         def called() -> Any:
-            frame = sys._getframe(1)
-            if threading.get_ident() == thread and not frame.f_code.co_filename.startswith(_OURS):
-                found.add(f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}")
+            frame: FrameType | None = sys._getframe(1)
+            assert frame is not None
+            place = f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
+            is_ours = frame.f_code.co_filename.startswith(_OURS)
+            while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+                frame = frame.f_back
+            if threading.get_ident() == thread and not is_ours and frame is None:  # None: not while importing
+                found.add(place)
             return read()
 
         return called

@@ -126,7 +126,7 @@ class Search:
             while not is_done:
                 try:
                     self._explored(counts_time, keeps_shared)
-                    is_done = True
+                    is_done = self.budget.is_explored = True
                 except SharedChanged:
                     keeps_shared = False
                 except (_Missing, Timed):  # something reads what is around it: a time limit's count, say
