@@ -105,14 +105,26 @@ def kind_of(thing: Any) -> Any:
     return type(thing)
 
 
-def shared_with(kinds: Iterable[type]) -> list[Any]:
-    """The plain objects that classes and their modules hold by a name, or in a list or dictionary.
+def holders_of(kinds: Iterable[type]) -> list[Any]:
+    """Classes, and the modules that they are of; without those of libraries."""
+    own = [each for each in kinds if not _is_library(each.__module__)]
+    return [
+        *own,
+        *dict.fromkeys(sys.modules[each.__module__] for each in own if each.__module__ in sys.modules),
+    ]
+
+
+def generators_of(holders: Iterable[Any]) -> list[Any]:
+    """The random generators that classes and modules hold by a name."""
+    return [value for each in holders for value in vars(each).values() if isinstance(value, GENERATORS)]
+
+
+def shared_with(holders: Iterable[Any]) -> list[Any]:
+    """The plain objects that classes and modules hold by a name, or in a list or dictionary.
 
     Code may ask of an attribute whether it is one of them.
     """
-    own = [each for each in kinds if not _is_library(each.__module__)]
-    modules = dict.fromkeys(sys.modules[each.__module__] for each in own if each.__module__ in sys.modules)
-    waiting: list[Any] = [list(vars(each).values()) for each in (*own, *modules)]
+    waiting: list[Any] = [list(vars(each).values()) for each in holders]
     found: dict[int, Any] = {}
     for depth in range(_DEEP):
         inner: list[Any] = []

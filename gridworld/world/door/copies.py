@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copyreg
+import enum
 import functools
 import io
 import pickle
@@ -111,6 +112,8 @@ _new: Any = vars(copyreg)["__newobj__"]  # which pickle knows as a call of __new
 @functools.lru_cache(1024)
 def _is_taken_apart(kind: Any) -> bool:
     """Whether its instances are copied attribute by attribute, for their own way may leave something out."""
+    if issubclass(kind, enum.Enum):  # which pickle keeps as its class's member
+        return False
     if issubclass(kind, gym.Env):
         return True
     root = kind.__module__.partition(".")[0]

@@ -23,9 +23,12 @@ _MORE = (
     "or on which object an attribute is"
 )
 _LONG_SHARE = 0.1  # of the episodes
-_LIVELY = 0.7  # how often an action is taken that does not end the episode, if there is any
+_CURIOUS = 0.8  # how often the action is taken that was taken least there, by which a walk goes everywhere
 _STEPS, _EPISODES = 3_000, 8  # at least
-_FEW, _EACH = 200, 5  # steps at least, and for each state and action, up to _STEPS, where nothing is left out
+_FEW, _EACH = (
+    200,
+    20,
+)  # steps at least, and for each state and action, up to _STEPS, where nothing is left out
 _LONGEST, _LONG = 10_000, 300  # steps of the first of them, and of others before any action is taken
 
 
@@ -51,7 +54,8 @@ def check_by_episodes(search: Search) -> None:
     """Play; of the states that what was shown so far leaves possible, one must lead to what is shown next."""
     numbers, size = np.random.default_rng(0), len(search.states)
     left = min(_STEPS, max(_FEW, _EACH * size * search.num_actions))
-    short = min(_LONG, 2 * max(each.depth for each in search.states) + 4)
+    met: dict[int, list[int]] = {}  # how often each action was taken in a state
+    short = min(_LONG, 4 * max(each.depth for each in search.states) + 4)
     search.branching.sampling = np.random.default_rng(2)
     try:
         while left > 0:
@@ -65,12 +69,11 @@ def check_by_episodes(search: Search) -> None:
                 rows = [search.states[each].steps if each < size else () for each in possible]
                 if not all(rows):
                     break  # beyond the step limit
-                ending = {
-                    a for row in rows for a, steps in enumerate(row) if any(s.terminated for s in steps)
-                }
-                living = [a for a in range(search.num_actions) if a not in ending]
-                choice = living if living and numbers.random() < _LIVELY else range(search.num_actions)
+                here = met.setdefault(min(possible), [0] * search.num_actions)
+                least = [a for a, count in enumerate(here) if count == min(here)]
+                choice = least if numbers.random() < _CURIOUS else range(search.num_actions)
                 action = choice[int(numbers.integers(len(choice)))]
+                here[action] += 1
                 observation, reward, terminated, truncated, _ = search.layers.env.step(np.int64(action))
                 found = search.see(observation), float(reward), bool(terminated)
                 steps = itertools.chain.from_iterable(row[action] for row in rows)

@@ -29,6 +29,8 @@ from gridworld.world.door import known
 from gridworld.world.door.attributes import (
     GENERATORS,
     attributes,
+    generators_of,
+    holders_of,
     layers_of,
     own_spaces,
     random_states,
@@ -101,15 +103,17 @@ class Layers:
         self.may_see_cuts = self.limited is not None and not all(map(known.steps_once, self.layers[:-1]))
         self.env: Any = self.layers[0]
         self.base: Any = self.layers[-1]
-        kinds = {kind: None for layer in self.layers for kind in type(layer).__mro__ if keeps_shared}
-        self.shared = {id(each): each for each in shared_with(kinds)}  # kept as they are
+        holders = holders_of(dict.fromkeys(kind for layer in self.layers for kind in type(layer).__mro__))
+        found = shared_with(holders) if keeps_shared else []
+        self.shared = {id(each): each for each in found}  # kept as they are
         self.met_shared = set[int]()
         self.fixed: dict[Any, Any] = {id(each): each for each in (*chain, branching)} | self.shared
         self._known = self.fixed  # and what is within attributes that are left in place
         self._shares = False  # whether lists and dictionaries are among these
         self._left: list[list[tuple[str, Any]]] = [[] for _ in self.layers]  # in place, by layers
         self._digest_left = b""
-        self._generators: list[tuple[Any, Any]] = []  # others than numpy's, with their states
+        # Those that cannot be replaced, with their states.
+        self._generators = [(each, state_of(each)) for each in generators_of(holders)]
         self.is_adopting = False
         self.ordinary: set[Any] = set(_PLAIN)  # classes whose objects are copied, unless they are known
 

@@ -27,7 +27,7 @@ from gridworld.world.door.world import Found, enumerated
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources.gymnasium_table import compile_table, has_table
 
-_IF_DRAWN = 40  # instances that are compared if making one draws random numbers
+_IF_DRAWN, _OTHERS = 40, 8  # instances that are compared, if making one is seen to draw, and otherwise
 
 
 def compile_id(
@@ -89,7 +89,7 @@ def found_by(make: Callable[[], Env], where: str = "env", name: str = "", **boun
     with closing(make()) as env:
         is_drawn = random_states() != before or _has_drawn(env)
         found, own = found_of(env, where, name, **bounds), traits(env)
-    for _ in range(_IF_DRAWN if is_drawn else 1):
+    for _ in range(_IF_DRAWN if is_drawn else _OTHERS):
         with closing(make()) as again:
             if traits(again) == own:
                 continue

@@ -1,5 +1,6 @@
 """Environments as people have them become exact worlds: wrappers, memory, Dicts, clocks, batches, classes."""
 
+import enum
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -759,4 +760,69 @@ def test_two_limits_around_a_wrapper_that_skips() -> None:
 )
 def test_what_cannot_be_asked_or_copied_is_refused(make: Callable[[], Any], told: str) -> None:
     with pytest.raises(InputError, match=told):
+        gridworld.compile_env(make())
+
+
+class Way(enum.Enum):
+    LEFT = -1
+    RIGHT = 1
+
+
+class Ways(enum.IntFlag):
+    NONE = 0
+    TURNED = 1
+
+
+class Turning(Coins):
+    """It holds members of enumerations: which way it faces, and whether it has turned."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.way, self.turned = Way.RIGHT, Ways.NONE
+
+    def begin(self) -> None:
+        self.way, self.turned = Way.LEFT, Ways.NONE
+
+    def step(self, action: int) -> Any:
+        if action == 0:
+            self.way, self.turned = Way(-self.way.value), Ways.TURNED
+        else:
+            self.at = max(0, min(self.at + self.way.value, 2))
+        is_there = self.at == 2 and self.way is Way.RIGHT and bool(self.turned & Ways.TURNED)
+        return self.at, float(is_there), is_there, False, {}
+
+
+def test_members_of_enumerations_are_state() -> None:
+    assert optimum(Turning()) == pytest.approx(0.99**2, abs=1e-12)
+
+
+DRAWING = np.random.default_rng(0)
+
+
+class Global(Coins):
+    """It draws from its module's generator, in the last cell only."""
+
+    def pay(self) -> float:
+        return float(self.at == 2 and DRAWING.random() < 0.5)
+
+
+class FarKey(Coins):
+    """Its class knows whether it has the key, which is at the far end."""
+
+    observation_space, size, key = spaces.Discrete(12), 12, False
+
+    def begin(self) -> None:
+        type(self).key = False
+
+    def step(self, action: int) -> Any:
+        self.at = max(0, min(self.at + (1 if action else -1), 11))
+        if self.at == 10:
+            type(self).key = True
+        opens = self.at == 0 and type(self).key
+        return self.at, float(opens), opens, False, {}
+
+
+@pytest.mark.parametrize("make", [Global, FarKey])
+def test_what_is_far_away_is_met_too(make: Callable[[], Any]) -> None:
+    with pytest.raises(InputError, match=r"another generator|depends on more"):
         gridworld.compile_env(make())
