@@ -153,7 +153,6 @@ def test_a_run_is_scored_on_its_own_world() -> None:
             "its states are continuous",
         ),
         (lambda: gridworld.compile_env(3), "env: int is not an environment"),
-        (lambda: gridworld.compile_env(gym.make("Taxi-v4", fickle_passenger=True)), "fickle_passenger=True"),
         (lambda: gridworld.compile_mdp("classic"), "layout='classic': must be a Layout; load"),  # type: ignore[arg-type]
         (lambda: gridworld.make_vec("FrozenLake"), "mdp=FrozenLake: must be a compiled world"),
         (
