@@ -12,7 +12,6 @@ from gridworld.api.sweeps import record as record
 from gridworld.api.sweeps import sweep as sweep
 from gridworld.api.sweeps import tune as tune
 from gridworld.api.worlds import compile_env as compile_env
-from gridworld.api.worlds import compile_mdp as compile_mdp
 from gridworld.api.worlds import evaluate as evaluate
 from gridworld.api.worlds import make_vec as make_vec
 from gridworld.base.errors import InputError as InputError
@@ -32,6 +31,7 @@ from gridworld.envs.registration import register_envs as register_envs
 from gridworld.envs.vector_env import GridWorldVectorEnv as GridWorldVectorEnv
 from gridworld.world.evaluation import Evaluator as Evaluator
 from gridworld.world.evaluation import Score as Score
+from gridworld.world.grid import compile_mdp as compile_mdp
 from gridworld.world.layout import Layout as Layout
 from gridworld.world.layout import load as load
 from gridworld.world.layout import shipped_layouts as shipped_layouts

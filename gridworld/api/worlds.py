@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from os import PathLike
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Discrete
@@ -21,12 +21,8 @@ from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.world.chain import as_numbers, policy_of_table
 from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES
 from gridworld.world.evaluation import Evaluator, PolicySnapshot, Score
-from gridworld.world.grid import GridMdp
-from gridworld.world.grid import compile_mdp as compiled_map
-from gridworld.world.layout import Layout
 from gridworld.world.mdp import FloatArray, Mdp
 from gridworld.world.sources.environment import make_env
-from gridworld.world.sources.gymnasium_table import mdp_of_table
 
 
 def evaluate(
@@ -186,55 +182,6 @@ def compile_env(
     given = partial(make_env, env) if isinstance(env, str) else env
     bounds = {"most_states": most_states, "most_seconds": most_seconds}
     return world_of(given, state=state, ignore=ignore, **bounds)
-
-
-@overload
-def compile_mdp(
-    layout: Layout,
-    slip: float = ...,
-    step_reward: float = ...,
-    goal_reward: float = ...,
-    trap_reward: float = ...,
-) -> GridMdp: ...
-
-
-@overload
-def compile_mdp(
-    layout: Mapping[int, Any] | Sequence[Any], slip: ArrayLike = ..., *, start: ArrayLike = ...
-) -> Mdp: ...
-
-
-def compile_mdp(
-    layout: Any,
-    slip: Any = 0.0,
-    step_reward: float = 0.0,
-    goal_reward: float = 1.0,
-    trap_reward: float = -1.0,
-    *,
-    start: Any = None,
-) -> Mdp:
-    """Compile a map and its rewards, or a transition table, into a world.
-
-    Args:
-        layout: the map; or a table `P`, as environments of Gymnasium have it: `P[state][action]` is a list of
-            (probability, next state, reward, terminated), of N states and A actions, numbered from 0.
-        slip: of a map, the probability that a move goes to one side instead; of a table, `start`.
-        step_reward: of every step, on a map.
-        goal_reward: of entering a goal.
-        trap_reward: of entering a trap or a cliff.
-        start: of a table, (N,) probabilities, or one state.
-
-    Raises:
-        InputError: a setting or a table that makes no world.
-
-    Example:
-        >>> stay, leave, over = [(1.0, 0, 0.0, False)], [(1.0, 1, 1.0, True)], [(1.0, 1, 0.0, True)]
-        >>> compile_mdp({0: {0: stay, 1: leave}, 1: {0: over, 1: over}}, start=0)
-        <Mdp P: 2 states, 2 actions>
-    """
-    if isinstance(layout, Mapping | list | tuple):
-        return mdp_of_table(layout, slip if start is None else start)
-    return compiled_map(layout, slip, step_reward, goal_reward, trap_reward)
 
 
 def make_vec(mdp: Mdp, num_envs: int = 1, **kwargs: Any) -> GridWorldVectorEnv:

@@ -9,12 +9,15 @@ as terminal cells do.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 from gridworld.base.bounds import STEP_LIMIT, positive_int
 from gridworld.base.errors import InputError
@@ -55,25 +58,54 @@ class GridMdp(Mdp):
         return divmod(state, self.layout.num_cols)
 
 
+@overload
 def compile_mdp(
     layout: Layout,
-    slip: float = 0.0,
+    slip: float = ...,
+    step_reward: float = ...,
+    goal_reward: float = ...,
+    trap_reward: float = ...,
+) -> GridMdp: ...
+
+
+@overload
+def compile_mdp(
+    layout: Mapping[int, Any] | Sequence[Any], slip: ArrayLike = ..., *, start: ArrayLike = ...
+) -> Mdp: ...
+
+
+def compile_mdp(
+    layout: Any,
+    slip: Any = 0.0,
     step_reward: float = 0.0,
     goal_reward: float = 1.0,
     trap_reward: float = -1.0,
-) -> GridMdp:
-    """Compile a layout and its rewards into tables.
+    *,
+    start: Any = None,
+) -> Mdp:
+    """Compile a map and its rewards, or a transition table, into a world.
 
     Args:
-        layout: the map.
-        slip: the probability that a move goes to one side instead.
-        step_reward: of every step.
+        layout: the map; or a table `P`, as environments of Gymnasium have it: `P[state][action]` is a list of
+            (probability, next state, reward, terminated), of N states and A actions, numbered from 0.
+        slip: of a map, the probability that a move goes to one side instead; of a table, `start`.
+        step_reward: of every step, on a map.
         goal_reward: of entering a goal.
         trap_reward: of entering a trap or a cliff.
+        start: of a table, (N,) probabilities, or one state.
 
     Raises:
-        InputError: a setting that makes no world.
+        InputError: a setting or a table that makes no world.
+
+    Example:
+        >>> stay, leave, over = [(1.0, 0, 0.0, False)], [(1.0, 1, 1.0, True)], [(1.0, 1, 0.0, True)]
+        >>> compile_mdp({0: {0: stay, 1: leave}, 1: {0: over, 1: over}}, start=0)
+        <Mdp P: 2 states, 2 actions>
     """
+    if isinstance(layout, Mapping | list | tuple):
+        from gridworld.world.sources.gymnasium_table import mdp_of_table  # here, since maps need NumPy alone
+
+        return mdp_of_table(layout, slip if start is None else start)
     if not isinstance(layout, Layout):
         raise InputError(
             f"layout={layout!r:.50}: must be a Layout; load({layout!r:.50}) reads a map by name or file, and "
