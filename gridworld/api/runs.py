@@ -40,7 +40,6 @@ from gridworld.training.train import train as train_in
 from gridworld.visualization.files import encode_png
 from gridworld.visualization.picture import Subject, drawer
 from gridworld.world.evaluation import Evaluator, PolicySnapshot
-from gridworld.world.mdp import BY_CONSTRUCTION
 
 if TYPE_CHECKING:  # of most runs nothing is drawn
     from PIL import Image
@@ -138,7 +137,7 @@ class RunResult:
         images = "".join(f'<img src="{each}" style="max-width:100%;max-height:340px"> ' for each in sources)
         why = "" if self.summary["certified"] else "; gridworld.diagnose(run) says why"
         sentence, scope = run_summary.verdict(self.summary), run_summary.scope_of(self.summary)
-        known = "" if scope == BY_CONSTRUCTION else f"<br>world: {escape(scope)}"
+        known = f"<br>world: {escape(scope)}" if scope else ""
         return f"<p>{escape(repr(self))}<br><b>{escape(sentence)}</b>{why}{known}</p>{images}"
 
     def __repr__(self) -> str:

@@ -150,9 +150,8 @@ def compile_env(
     Args:
         env: an environment of Gymnasium with all its wrappers, a class or a function that makes one, or a
             batch of Gymnasium or SB3. A GridWorld, and FrozenLake, CliffWalking and Taxi by their transition
-            tables, are known; of any other, every action is tried in a copy of
-            every state. Or a name: what `env=NAME` means on a command line, an id of Gymnasium, or
-            `module:NAME`.
+            tables, are known; of any other, every action is tried in a copy of every state. Or a name: what
+            `env=NAME` means on a command line, an id of Gymnasium, or `module:NAME`.
         state: a function of the environment without wrappers that returns all that matters of its state, by
             your word; None: what the attributes of all layers hold.
         ignore: names of attributes that are not part of its state, by your word.

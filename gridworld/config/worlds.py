@@ -29,6 +29,7 @@ from gridworld.config.fields import (
     bounds,
     setting,
 )
+from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
     from gridworld.world.grid import GridMdp
@@ -111,9 +112,9 @@ class GymnasiumConfig(EnvConfig):
     # attributes that are not part of its state, by your word
     ignore: list[Word] = field(default_factory=list)
     # a search that finds more states is refused
-    most_states: int = setting(200_000, affects(Effect.NOTHING), bounds(1, 512 * 512))
+    most_states: int = setting(MOST_STATES, affects(Effect.NOTHING), bounds(1, 512 * 512))
     # a search that takes longer is refused
-    most_seconds: float = setting(120, affects(Effect.NOTHING), bounds(0, 86_400, above=True))
+    most_seconds: float = setting(MOST_SECONDS, affects(Effect.NOTHING), bounds(0, 86_400, above=True))
 
     @property
     def name(self) -> str:

@@ -115,20 +115,13 @@ def world_of(env: Any, **bounds: Any) -> Mdp:
 
 
 def _task(env: Any, **bounds: Any) -> Task:
-    if isinstance(env, gym.Env):
-        return _single(env, **bounds)
-    if isinstance(env, gym.vector.VectorEnv) or hasattr(env, "step_wait"):
+    is_env = isinstance(env, gym.Env)
+    if not is_env and (isinstance(env, gym.vector.VectorEnv) or hasattr(env, "step_wait")):
         return _batch(env, **bounds)
-    if callable(env):
+    if not is_env and callable(env):
         return _made(env, **bounds)
-    return _single(
-        as_environment(
-            "env",
-            env,
-            "an environment or a batch of Gymnasium or SB3, a class or a function that makes one, a compiled "
-            "world, or a world's name",
-        )
-    )
+    wanted = "an environment or a batch of Gymnasium or SB3, a class or a function that makes one, a compiled"
+    return _single(as_environment("env", env, f"{wanted} world, or a world's name"), **bounds)
 
 
 def _made(make: Any, **bounds: Any) -> Task:

@@ -22,7 +22,7 @@ from gridworld.config.settings import NEWER, flat, privileges
 from gridworld.run.folder import CURVE, MANIFEST, SUMMARY, VISITS
 from gridworld.run.reader import ONLINE, REQUIRED, RunReader, check_is_folder, read_columns, read_run
 from gridworld.run.summary import scope_of
-from gridworld.world.mdp import BY_CONSTRUCTION, FloatArray
+from gridworld.world.mdp import FloatArray
 from gridworld.world.metrics import METRICS
 
 MOST_ENTRIES = 2_000_000  # files and folders below a given one: some seconds
@@ -197,7 +197,7 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
         pictures=run.pictures(),
         step_limit=summary.get("max_episode_steps"),
         privileges=privileges(config),
-        scope="" if (scope := scope_of(summary)) == BY_CONSTRUCTION else printable(scope)[:_LONGEST_SCOPE],
+        scope=printable(scope_of(summary))[:_LONGEST_SCOPE],
         damage=damaged,
     )
 

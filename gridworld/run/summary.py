@@ -77,7 +77,7 @@ def summary_text(summary: Summary, folder: str, advice: Sequence[str] = ()) -> s
         *(f"  {line}" for line in aligned(rows, ("<21", ">9", ">9", ">9", "<0"))),
         "",
         f"  {verdict(summary)}",
-        *([f"  world: {scope}"] if (scope := scope_of(summary)) != BY_CONSTRUCTION else []),
+        *([f"  world: {scope}"] if (scope := scope_of(summary)) else []),
         *([f"  privileges: {', '.join(summary['privileges'])}"] if summary["privileges"] else []),
         *(f"  {line}" for line in advice),
         f"  files: {folder}",
@@ -122,8 +122,9 @@ def verdict(summary: Summary) -> str:
 
 
 def scope_of(summary: Summary) -> str:
-    """How the tables of the world are known, which earlier runs said in fewer words."""
-    return str(summary.get("scope", summary.get("truth", BY_CONSTRUCTION)))
+    """How the tables of the world are known, which earlier runs said in fewer words; "" by construction."""
+    scope = str(summary.get("scope", summary.get("truth", BY_CONSTRUCTION)))
+    return "" if scope == BY_CONSTRUCTION else scope
 
 
 def circles_text(count: int, names: Sequence[str], timeout_probability: float) -> str:

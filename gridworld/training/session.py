@@ -186,9 +186,7 @@ class Session:
 
     def _on_safe_point(self, steps: int) -> None:
         """Save if it is time for it; nothing is half done here."""
-        asked = (
-            self._stop.number is not None
-        )  # a signal that arrives from here on waits for the next safe point
+        asked = self._stop.number is not None  # a later signal waits for the next safe point
         is_last = steps >= self._config.total_timesteps
         if (asked or is_last or self._pace.is_due(steps)) and steps != self.checkpoints.newest:
             started = time.perf_counter()

@@ -129,11 +129,11 @@ class SB3Agent(Agent):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # which come again while it learns
-                model, policy, mdp = self._model, self._model.policy, self._envs.mdp
-                why = why_no_table(policy, self.observation)
-                if why is None and self.acts_by() is not None:
-                    acting = np.flatnonzero(mdp.acting)
-                    why = why_unsteady(model, policy, self.observation, acting, mdp.num_actions)
+                model, policy = self._model, self._model.policy
+                if self.acts_by() is None:
+                    why = why_no_table(policy, self.observation)
+                else:
+                    why = why_unsteady(model, policy, self.observation, self._envs.mdp)
         except InputError as error:
             raise unfit(self.config, f"cannot be evaluated: {error!s}") from None
         except Exception as error:  # the class may be anybody's
@@ -177,8 +177,7 @@ class SB3Agent(Agent):
         found = self._snapshot(*read_table(self._model.policy, self.observation))
         if self.acts_by() is None:
             return found
-        actions = predicted(self._model, self.observation, found.sampled.shape[1])
-        return replace(found, greedy=actions)
+        return replace(found, greedy=predicted(self._model, self.observation, self._envs.mdp))
 
     def _snapshot(
         self, values: FloatArray, probabilities: FloatArray | None, q: FloatArray | None

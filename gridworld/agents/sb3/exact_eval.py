@@ -19,10 +19,9 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped, sync_envs_normalization
 
 from gridworld.agents.sb3.policy_outputs import (
-    LIBRARIES,
     explored,
+    is_of_libraries,
     predicted,
-    predicts_by,
     read_table,
     why_unreadable,
     why_unsteady,
@@ -76,7 +75,7 @@ class ForeignPolicy:
         predicts = (model.predict, policy.predict)
         takes_masks = any("action_masks" in inspect.signature(each).parameters for each in predicts)
         self._masks = task.masks() if takes_masks else None
-        self._is_known = _is_of_a_library(model, policy)  # so that its network says how it explores
+        self._is_known = is_of_libraries(model, policy)  # so that its network says how it explores
         self._check_is_a_table(self._observation())
 
     def tables(self) -> Tables:
@@ -88,7 +87,7 @@ class ForeignPolicy:
         if not np.isfinite(outputs).all():
             raise InputError("the model's outputs are not finite numbers; its training has diverged")
         greedy = one_hot_policy(
-            predicted(self._model, observation, outputs.shape[1], self._masks), outputs.shape[1]
+            predicted(self._model, observation, self._task.mdp, self._masks), outputs.shape[1]
         )
         self._policy.set_training_mode(was_training)
         epsilon = float(getattr(self._model, "exploration_rate", 0.0))
@@ -135,16 +134,9 @@ class ForeignPolicy:
         self._guess_is_fine = True
 
     def _check_is_a_table(self, observation: ObservationTable) -> None:
-        acting = np.flatnonzero(self._task.mdp.acting)
-        asked = self._model, self._policy, observation, acting, self._task.mdp.num_actions, self._masks
+        asked = self._model, self._policy, observation, self._task.mdp, self._masks
         if (reason := why_unsteady(*asked)) is not None:
             raise InputError(f"the model {reason}")
-
-
-def _is_of_a_library(model: Any, policy: BasePolicy) -> bool:
-    """Whether no custom layer or `predict` decides on an action."""
-    layers = (type(each).__module__ for each in policy.modules())
-    return predicts_by(model, policy) is None and all(each.startswith(LIBRARIES) for each in layers)
 
 
 class ExactEvalCallback(BaseCallback):

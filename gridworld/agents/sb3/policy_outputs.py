@@ -16,16 +16,15 @@ from torch import Tensor, nn
 from gridworld.base.errors import InputError, in_short
 from gridworld.envs.observations import ObservationTable
 from gridworld.world.door.attributes import random_states
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 CHUNK = 4096  # states a forward pass
 _ASKED = 512  # states
 _PART = 3
 NO_TABLE = "so it cannot be evaluated exactly"
-LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.", "torch.")
+_LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.", "torch.")
 _PREDICTS = ("predict", "_predict")  # what decides an action, of a model or a policy
-_ONE_BY_ONE = 512  # states in which `predict` is asked alone, too
-_OFTEN = 100  # times, where `predict` is a custom one
+_OFTEN = 100  # times, where a custom layer or `predict` decides
 
 
 class Reading(NamedTuple):
@@ -111,23 +110,28 @@ def predicts_by(model: Any, policy: BasePolicy) -> str | None:
     for thing in (model, policy):
         for name in _PREDICTS:
             method = getattr(type(thing), name, None)
-            if name in vars(thing) or not getattr(method, "__module__", LIBRARIES[0]).startswith(LIBRARIES):
+            if name in vars(thing) or not getattr(method, "__module__", _LIBRARIES[0]).startswith(_LIBRARIES):
                 return f"{type(thing).__module__}.{type(thing).__qualname__}"
     return None
 
 
+def is_of_libraries(model: Any, policy: BasePolicy) -> bool:
+    """Whether no custom layer or `predict` decides on an action."""
+    layers = (type(each).__module__ for each in policy.modules())
+    return predicts_by(model, policy) is None and all(each.startswith(_LIBRARIES) for each in layers)
+
+
 def predicted(
-    model: Any, observation: ObservationTable, actions: int, masks: BoolArray | None = None, **more: Any
+    model: Any, observation: ObservationTable, mdp: Mdp, masks: BoolArray | None = None, **more: Any
 ) -> IntArray:
     """(S,), the actions that `predict` takes in all states, asked in batches."""
     states = np.arange(observation.num_states)
-    starts = range(0, len(states), CHUNK)
-    asked = (states[at : at + CHUNK] for at in starts)
-    return np.concatenate([_predicted(model, observation, actions, masks, each, **more) for each in asked])
+    asked = (states[at : at + CHUNK] for at in range(0, len(states), CHUNK))
+    return np.concatenate([_predicted(model, observation, mdp, masks, each, **more) for each in asked])
 
 
 def _predicted(
-    model: Any, observation: ObservationTable, actions: int, masks: Any, states: Any, **more: Any
+    model: Any, observation: ObservationTable, mdp: Mdp, masks: Any, states: Any, **more: Any
 ) -> IntArray:
     """(n,), the actions in some states; `states` is one number to ask as for a single environment."""
     if masks is not None:
@@ -140,41 +144,35 @@ def _predicted(
     if state is not None:
         raise InputError(f"the model: its predict() keeps a state between steps, {NO_TABLE}")
     fits = taken.shape == np.shape(states) and taken.dtype.kind in "iu"
-    if not fits or not np.isin(taken, np.arange(actions)).all():
+    if not fits or not np.isin(taken, np.arange(mdp.num_actions)).all():
         raise InputError(
             f"the model: its predict() returned {str(taken)[:60]} for {np.size(states)} states; must be an "
-            f"action per state, from 0 to {actions - 1}"
+            f"action per state, {mdp.action_choices()}"
         )
     return taken
 
 
 def why_unsteady(
-    model: Any,
-    policy: BasePolicy,
-    observation: ObservationTable,
-    acting: IntArray,
-    actions: int,
-    masks: BoolArray | None = None,
+    model: Any, policy: BasePolicy, observation: ObservationTable, mdp: Mdp, masks: BoolArray | None = None
 ) -> str | None:
     """Why `predict` is not a function of what it is shown: asked alone and together, in two orders, again.
 
-    `acting` are the states of interest. It is left as it was.
+    The policy is left as it was.
     """
     was_training, before = policy.training, random_states()
-    some = acting[:_ONE_BY_ONE]
-    together = predicted(model, observation, actions, masks)[some]
+    some = np.flatnonzero(mdp.acting)[:_ASKED]
+    together = predicted(model, observation, mdp, masks)[some]
 
     def alone(states: IntArray) -> IntArray:
-        return np.array([_predicted(model, observation, actions, masks, state) for state in states])
+        return np.array([_predicted(model, observation, mdp, masks, state) for state in states])
 
     rounds = [alone(some), alone(some[::-1])[::-1]]
-    is_own = predicts_by(model, policy) is not None
-    rounds += [predicted(model, observation, actions, masks)[some] for _ in range(_OFTEN if is_own else 1)]
-    if is_own and "episode_start" in inspect.signature(model.predict).parameters:
-        for value in (True, False):
-            begins = np.full(observation.num_states, value)[:CHUNK]
-            if observation.num_states <= CHUNK:
-                rounds.append(predicted(model, observation, actions, masks, episode_start=begins)[some])
+    often = 1 if is_of_libraries(model, policy) else _OFTEN
+    rounds += [predicted(model, observation, mdp, masks)[some] for _ in range(often)]
+    takes_starts = "episode_start" in inspect.signature(model.predict).parameters
+    if takes_starts and predicts_by(model, policy) is not None and observation.num_states <= CHUNK:
+        for begins in np.tile([[True], [False]], observation.num_states):
+            rounds.append(predicted(model, observation, mdp, masks, episode_start=begins)[some])
     reason = why_no_table(policy, observation)
     policy.set_training_mode(was_training)
     if reason is None and random_states() != before:

@@ -70,9 +70,7 @@ def _slots(kind: Any) -> tuple[str, ...]:
 
 def own_spaces(layer: Any) -> list[Any]:
     """The spaces of a layer, which may be its class's."""
-    return [
-        getattr(layer, name, None) for name in ("action_space", "observation_space")
-    ]  # of its class, maybe
+    return [getattr(layer, name, None) for name in ("action_space", "observation_space")]
 
 
 def spaces_in(held: Any) -> Iterator[gym.Space[Any]]:

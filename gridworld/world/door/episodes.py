@@ -25,10 +25,7 @@ _MORE = (
 _LONG_SHARE = 0.1  # of the episodes
 _CURIOUS = 0.8  # how often the action is taken that was taken least there, by which a walk goes everywhere
 _STEPS, _EPISODES = 3_000, 8  # at least
-_FEW, _EACH = (
-    200,
-    20,
-)  # steps at least, and for each state and action, up to _STEPS, where nothing is left out
+_FEW, _EACH = 200, 20  # steps of any search: at least, and for each state and action, up to _STEPS
 _LONGEST, _LONG = 10_000, 300  # steps of the first of them, and of others before any action is taken
 
 
@@ -36,8 +33,7 @@ def check_by_word(search: Search) -> int | None:
     """Play with numpy's own generator; returns when the environment cuts episodes, if it does."""
     numbers, steps, episode = np.random.default_rng(0), 0, 0
     limit: int | None = None
-    search.branching.sampling = np.random.default_rng(1)
-    try:
+    with search.branching.drawing(np.random.default_rng(1)):
         while steps < _STEPS or episode < _EPISODES:
             lives = _LONGEST if episode == 0 else int(numbers.integers(1, _LONG))
             took, is_cut = _episode(search, numbers, lives)
@@ -45,8 +41,6 @@ def check_by_word(search: Search) -> int | None:
                 raise search.refusal(NO_LIMIT)
             limit = took if is_cut else limit
             steps, episode = steps + took, episode + 1
-    finally:
-        search.branching.sampling = None
     return limit
 
 
@@ -56,8 +50,7 @@ def check_by_episodes(search: Search) -> None:
     left = min(_STEPS, max(_FEW, _EACH * size * search.num_actions))
     met: dict[int, list[int]] = {}  # how often each action was taken in a state
     short = min(_LONG, 4 * max(each.depth for each in search.states) + 4)
-    search.branching.sampling = np.random.default_rng(2)
-    try:
+    with search.branching.drawing(np.random.default_rng(2)):
         while left > 0:
             search.layers.put(search.first)
             seen = search.see(search.layers.env.reset()[0])
@@ -87,8 +80,6 @@ def check_by_episodes(search: Search) -> None:
                 if terminated or truncated:
                     break
             left -= 1
-    finally:
-        search.branching.sampling = None
 
 
 def _episode(search: Search, numbers: np.random.Generator, lives: int) -> tuple[int, bool]:

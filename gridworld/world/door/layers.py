@@ -16,7 +16,7 @@ import itertools
 import math
 import random
 import types
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from operator import itemgetter
 from typing import Any
@@ -48,8 +48,6 @@ _CODE = (type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, 
 _KEPT = (gym.Space, gym.envs.registration.EnvSpec, *_CODE)
 _SMALL, _LARGE = 1024, 256  # bytes of all copies, up to which all is copied; beyond it, of one attribute
 _PLAIN = frozenset({list, tuple, dict, set, frozenset, collections.deque})
-
-
 _MARK = object()  # in place of any generator
 
 
@@ -124,7 +122,7 @@ class Layers:
         values = [each for layer, held in before for each in (*held.values(), *own_spaces(layer))]
         spaces = {id(space): (space, vars(space).get("_np_random")) for space in spaces_in(values)}.values()
         self._random = random_states()
-        self._shared_before = self._shared_content()
+        self._shared_before = self._shared_content(self.shared)
         try:
             self._adopt()
             for space, _ in spaces:
@@ -277,19 +275,20 @@ class Layers:
         if self._changed_shared():
             raise SharedChanged
 
-    def _shared_content(self) -> dict[int, bytes]:
-        """What each of these objects holds, by their ids; without those that cannot be copied."""
+    def _shared_content(self, keys: Iterable[int]) -> dict[int, bytes]:
+        """What these of the shared objects hold, by their ids; without those that cannot be copied."""
         found, met = {}, self.met_shared.copy()
-        for each in self.shared.values():
+        for key in keys:
             with contextlib.suppress(Exception):  # of anybody's
-                found[id(each)] = self._dump(attributes(each), self.fixed)
+                found[key] = self._dump(attributes(self.shared[key]), self.fixed)
         self.met_shared = met  # without what they hold of each other
         return found
 
     def _changed_shared(self) -> list[int]:
         """Those that an attribute was, and that hold something else than before."""
-        now, met = self._shared_content(), self.met_shared
-        return [key for key, content in self._shared_before.items() if key in met and now.get(key) != content]
+        watched = self.met_shared & self._shared_before.keys()
+        now = self._shared_content(watched)
+        return [key for key in watched if now.get(key) != self._shared_before[key]]
 
     def everything(self, *more: Any) -> bytes:
         """A copy of every attribute, and of `more`; what cannot be copied raises whatever it raises."""

@@ -16,7 +16,8 @@ import functools
 import linecache
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from types import CodeType, FrameType
@@ -96,6 +97,15 @@ class Rejecting(Branching):
         self._compared: Counter[Any] = Counter()
         self._remembers = remembers
         self._known: dict[Any, dict[Any, Fraction]] = {}  # what follows a draw, if it remembers
+
+    @contextmanager
+    def drawing(self, numbers: np.random.Generator) -> Iterator[None]:
+        """In this block, draws are those of a generator of numpy's."""
+        self.sampling = numbers
+        try:
+            yield
+        finally:
+            self.sampling = None
 
     def outcomes(self, step: Callable[[], Result]) -> dict[Result, Fraction]:
         """The different results of a step, each with its probability."""
@@ -268,11 +278,8 @@ class Rejecting(Branching):
 
         self._compared[places] += 1
         size = SAMPLES if self._compared[places] == 1 else _AGAIN
-        self.sampling = np.random.default_rng(_SEED + sum(self._compared.values()))
-        try:
+        with self.drawing(np.random.default_rng(_SEED + sum(self._compared.values()))):
             counts = Counter(step() for _ in range(size))
-        finally:
-            self.sampling = None
         if counts.keys() - expected.keys():
             return True
         level = FALSE_ALARM / (2 * len(expected))

@@ -320,6 +320,8 @@ class Search:
         """
         self.layers.check_left()
         for state in states:
+            if not state.copy:  # it was tried, before one further than the step limit was refused
+                continue
             is_marked = state.number.bit_count() <= 1
             if is_marked and (len(self.resets.starts) <= _FEW_STARTS or not state.number):
                 self.resets.check(state.copy)

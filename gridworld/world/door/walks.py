@@ -16,8 +16,7 @@ _WALKS, _WALK = 20, 10  # walks, and the steps of each
 def walk(search: Search, kind: type, look: Callable[[], None] = lambda: None) -> list[Any]:
     """What some walks with numpy's own generator and actions of a type show; `look` is called after each."""
     numbers, shown, fails = np.random.default_rng(0), list[Any](), False
-    search.branching.sampling = np.random.default_rng(1)
-    try:
+    with search.branching.drawing(np.random.default_rng(1)):
         for _ in range(_WALKS):
             try:
                 shown += _steps(search, kind, numbers)
@@ -27,8 +26,6 @@ def walk(search: Search, kind: type, look: Callable[[], None] = lambda: None) ->
             look()
             if fails:
                 break
-    finally:
-        search.branching.sampling = None
     return shown
 
 
