@@ -113,11 +113,6 @@ class Branching:
             raise self._not_repeatable()
         return result  # type: ignore[no-any-return]
 
-    @property
-    def has_drawn(self) -> bool:
-        """Whether anything was decided in this run."""
-        return self._place > 0
-
     def decide(self, weights: Weights) -> int:
         """The number of an outcome, drawn with probabilities in proportion to these weights."""
         place = self._place

@@ -17,7 +17,10 @@ from gridworld.world.door.beliefs import Step
 if TYPE_CHECKING:
     from gridworld.world.door.search import Search
 
-NO_LIMIT = "it truncates some episodes earlier than others, so it has no single step limit"
+NO_LIMIT = (
+    "it truncates some episodes earlier than others, so it has no single step limit; let step() return "
+    "terminated=True where something ends an episode, and truncated=True only after a fixed number of steps"
+)
 _MORE = (
     "so it depends on more than its attributes: on what its class, its module, a function or a file holds, "
     "or on which object an attribute is"
@@ -52,7 +55,7 @@ def check_by_episodes(search: Search) -> None:
     short = min(_LONG, 4 * max(each.depth for each in search.states) + 4)
     with search.branching.drawing(np.random.default_rng(2)):
         while left > 0:
-            search.layers.put(search.first)
+            search.layers.put(search.begin)
             seen = search.see(search.layers.env.reset()[0])
             possible = {each.following for each in search.resets.starts if each.seen == seen}
             if not possible:

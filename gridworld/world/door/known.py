@@ -25,6 +25,7 @@ _NEUTRAL = (
 )
 _NEUTRAL_ELSEWHERE = (("stable_baselines3.common.monitor", "Monitor"),)
 _ONE_STEP = (gym.Wrapper, gym.ObservationWrapper, gym.RewardWrapper, gym.ActionWrapper)
+_BLACKJACK = ("gymnasium.envs.toy_text.blackjack", "BlackjackEnv")
 _FACING = ("right", "down", "left", "up")  # minigrid's directions
 # What only draws, sounds or waits: it is no state.
 _KEPT = (
@@ -97,48 +98,62 @@ def place_of(env: Any) -> tuple[str, tuple[str, int, int]] | None:
 
 
 def _hands(env: Any) -> Any:
-    """Blackjack's hands: all that its rules read of one is the sum, an ace, and whether it is a natural."""
-    hands = [(sum(hand), 1 in hand, sorted(hand) == [1, 10]) for hand in (env.dealer, env.player)]
-    return env.dealer[:1], *hands
+    """Blackjack's hands: its rules read the sum of one, whether an ace may count 11, and a natural."""
+    sums = [(sum(hand), 1 in hand, sorted(hand) == [1, 10]) for hand in (env.dealer, env.player)]
+    return env.dealer[:1], *((total, ace and total <= 11, natural) for total, ace, natural in sums)
 
 
 def state_reader(env: Any) -> Callable[[Any], Any] | None:
     """What the state of a known environment is, where its attributes hold more than matters."""
-    kind: Any = getattr(sys.modules.get("gymnasium.envs.toy_text.blackjack"), "BlackjackEnv", None)
-    is_blackjack = kind is not None and type(env) is kind
-    return _hands if is_blackjack else None
+    return _hands if type(env) in _loaded((_BLACKJACK,)) else None
+
+
+def _reset_blackjack(self: Any, *, seed: int | None = None, options: Any = None) -> Any:
+    """Deals without drawing the suit and the face of the card that is painted."""
+    module: Any = sys.modules[_BLACKJACK[0]]
+    self.dealer, self.player = (module.draw_hand(self.np_random) for _ in range(2))
+    return self._get_obs(), {}
+
+
+def _place_obj(
+    self: Any, obj: Any, top: Any = None, size: Any = None, reject_fn: Any = None, **more: Any
+) -> Any:
+    """MiniGrid draws cells until one fits, and counts its tries: draw among those that fit instead."""
+    left, upper = (max(each, 0) for each in top or (0, 0))
+    wide, high = size or (self.grid.width, self.grid.height)
+    cells = [
+        (column, row)
+        for column in range(left, min(left + wide, self.grid.width))
+        for row in range(upper, min(upper + high, self.grid.height))
+        if self.grid.get(column, row) is None
+        and tuple(self.agent_pos) != (column, row)
+        and not (reject_fn and reject_fn(self, (column, row)))
+    ]
+    cell = cells[int(self.np_random.integers(len(cells)))]
+    self.grid.set(*cell, obj)
+    if obj is not None:
+        obj.init_pos = obj.cur_pos = cell
+    return cell
+
+
+# Methods of known classes that draw more than matters, and what is in their place while states are found.
+_PATCHES: tuple[tuple[tuple[str, str], str, Callable[..., Any]], ...] = (
+    (_BLACKJACK, "reset", _reset_blackjack),
+    (("minigrid.minigrid_env", "MiniGridEnv"), "place_obj", _place_obj),
+)
 
 
 @contextmanager
 def patched(env: Any) -> Iterator[None]:
-    """MiniGrid draws cells until one fits, and counts its tries: draw among those that fit instead."""
-    kind: Any = getattr(sys.modules.get("minigrid.minigrid_env"), "MiniGridEnv", None)
-    if kind is None or not isinstance(env, kind):
-        yield
-        return
-    original = kind.place_obj
-
-    def place_obj(
-        self: Any, obj: Any, top: Any = None, size: Any = None, reject_fn: Any = None, **more: Any
-    ) -> Any:
-        left, upper = (max(each, 0) for each in top or (0, 0))
-        wide, high = size or (self.grid.width, self.grid.height)
-        cells = [
-            (column, row)
-            for column in range(left, min(left + wide, self.grid.width))
-            for row in range(upper, min(upper + high, self.grid.height))
-            if self.grid.get(column, row) is None
-            and tuple(self.agent_pos) != (column, row)
-            and not (reject_fn and reject_fn(self, (column, row)))
-        ]
-        cell = cells[int(self.np_random.integers(len(cells)))]
-        self.grid.set(*cell, obj)
-        if obj is not None:
-            obj.init_pos = obj.cur_pos = cell
-        return cell
-
-    kind.place_obj = place_obj
+    """Put these in place."""
+    found = [
+        (kind, *patch) for known, *patch in _PATCHES for kind in _loaded((known,)) if isinstance(env, kind)
+    ]
+    originals = [(kind, name, getattr(kind, name)) for kind, name, _ in found]
+    for kind, name, method in found:
+        setattr(kind, name, method)
     try:
         yield
     finally:
-        kind.place_obj = original
+        for kind, name, method in originals:
+            setattr(kind, name, method)

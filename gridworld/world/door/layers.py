@@ -42,6 +42,7 @@ from gridworld.world.door.attributes import (
 from gridworld.world.door.copies import ATOMS, Copier, Reader, Recorder, SharedCopier
 from gridworld.world.door.stand_ins import Limited, Recorded, Timed
 from gridworld.world.door.uniform import Uniform
+from gridworld.world.door.unread import NUMBERS, Unread
 
 Env = gym.Env[Any, Any]
 _CODE = (type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, np.ufunc)
@@ -110,6 +111,9 @@ class Layers:
         self._shares = False  # whether lists and dictionaries are among these
         self._left: list[list[tuple[str, Any]]] = [[] for _ in self.layers]  # in place, by layers
         self._digest_left = b""
+        self.read: set[tuple[int, str]] = set()  # attributes that something has read
+        self.unread: set[tuple[int, str]] = set()  # numbers that change, and that nothing has read so far
+        self._stand_ins: dict[tuple[int, str], Unread] = {}
         # Those that cannot be replaced, with their states.
         self._generators = [(each, state_of(each)) for each in generators_of(holders)]
         self.is_adopting = False
@@ -203,7 +207,15 @@ class Layers:
         return InputError(f"{self._where}: its attributes cannot be copied ({in_short(error)})")
 
     def leave(self, changing: set[tuple[int, str]]) -> None:
-        """Leave in place what is not known to change: single values, and what is large if all of it is."""
+        """Leave in place what is not known to change: single values, and what is large if all of it is.
+
+        A stand-in takes the place of each number that changes and that nothing has read so far.
+        """
+        self._left, self._known, self._shares = [[] for _ in self.layers], self.fixed, False
+        self.unread = changing - self.read
+        for key in self.unread - self._stand_ins.keys():
+            self._keep(stand_in := Unread(*key))
+            self._stand_ins[key] = stand_in
         held = [
             (number, name, value)
             for number, layer in enumerate(self.layers)
@@ -231,11 +243,6 @@ class Layers:
         """Whether a value cannot change but by another in its place."""
         return type(value) in ATOMS or id(value) in self.fixed
 
-    def leave_nothing(self) -> None:
-        """Everything is in the copies."""
-        self._left = [[] for _ in self.layers]
-        self._known, self._shares = dict(self.fixed), False
-
     def _content_left(self) -> bytes:
         return self._dump([[value for _, value in left] for left in self._left], self.fixed)
 
@@ -262,6 +269,9 @@ class Layers:
                 now = found.pop(name, Changed)
                 if now is not value and not (type(now) is type(value) in ATOMS and now == value):
                     raise Changed([(number, name)])
+            for name in found:
+                if (number, name) in self.unread and type(found[name]) in NUMBERS:
+                    found[name] = self._stand_ins[number, name]
             held.append(sorted((item for item in found.items() if item[0] not in without), key=itemgetter(0)))
         return held
 

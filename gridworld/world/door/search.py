@@ -7,6 +7,7 @@ is tried from every state and end too: it must always lead to the same.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import itertools
@@ -32,6 +33,7 @@ from gridworld.world.door.observations import leaves
 from gridworld.world.door.rejection import Rejecting
 from gridworld.world.door.resets import Resets
 from gridworld.world.door.stand_ins import Limited, Timed
+from gridworld.world.door.unread import Read
 from gridworld.world.door.walks import walk
 from gridworld.world.outcomes import MOST_ACTIONS
 
@@ -39,7 +41,6 @@ OVER = -1  # in place of the state in which an episode ends
 _BEYOND = 1_000  # states further than a step limit that are found too, so that a small world is whole
 _BATCH = 1_000  # states that are tried before a reset is tried from each of them
 _DEEPEST = 10_000  # steps from the start
-_FEW_STARTS = 256  # of more, every outcome of a reset is tried from the first and the last state only
 _LONGEST_NAME = 60  # of a state that is called by its observation
 _NOT_REPEATED = (
     "it does not repeat a walk with the same random numbers, so it depends on more than its attributes and "
@@ -112,6 +113,7 @@ class Search:
             ) from error
         self.observations: dict[bytes, Any] = {}  # by their digests
         self.shown: dict[bytes, str] = {}  # the same as short texts
+        self._met: dict[Any, bytes] = {}  # the digests of numbers, and of tuples of such
         self.limit_met: int | None = None  # the time at which it cuts episodes, where the time is no state
         self.budget = Budget(self, most_states, most_seconds)
 
@@ -138,7 +140,7 @@ class Search:
         self.layers = layers = Layers(self.where, self.env, self.branching, counts_time, keeps_shared)
         self._is_complete = counts_time  # nothing that an environment may read is left out
         with layers.restored():
-            begin, before = layers.take(), layers.values()
+            self.begin, before = layers.take(), layers.values()
             changing: set[tuple[int, str]] = set()
 
             def look() -> None:
@@ -147,14 +149,17 @@ class Search:
 
             as_sent = walk(self, np.int64, look)
             for kind, mistake in ((np.int64, _NOT_REPEATED), (int, _INTS)):
-                layers.put(begin)
+                layers.put(self.begin)
                 if walk(self, kind) != as_sent:
                     layers.check_generators()
                     raise self.refusal(mistake)
             while True:
-                layers.put(begin)
+                layers.put(self.begin)
                 layers.leave(changing)
                 try:
+                    if layers.unread and walk(self, np.int64) != as_sent:
+                        raise Read(layers.unread)
+                    layers.put(self.begin)
                     self._explore(layers.limit)
                     layers.check_left()
                     layers.check_shared()
@@ -164,6 +169,9 @@ class Search:
                         check_by_episodes(self)
                     layers.check_generators()
                     return
+                except Read as error:
+                    layers.read |= error.found
+                    continue
                 except Changed as error:
                     found = error.found
                 except InputError as error:
@@ -171,7 +179,6 @@ class Search:
                     if not (found := layers.changed_left()):
                         raise self._explained(error) from None
                 changing |= set(found)
-                layers.leave_nothing()
 
     def _explained(self, error: InputError) -> InputError:
         space = self.env.observation_space
@@ -294,6 +301,8 @@ class Search:
             return error
         if isinstance(error, AttributeError) and not self._is_complete:
             return _Missing()
+        if unread := self.layers.unread:  # which may be why
+            raise Read(unread)
         return self.refusal(f"{what} fails: {in_short(error)}")
 
     def _tried(self, state: State) -> list[list[Step]]:
@@ -322,8 +331,7 @@ class Search:
         for state in states:
             if not state.copy:  # it was tried, before one further than the step limit was refused
                 continue
-            is_marked = state.number.bit_count() <= 1
-            if is_marked and (len(self.resets.starts) <= _FEW_STARTS or not state.number):
+            if state.number.bit_count() <= 1:
                 self.resets.check(state.copy)
             else:
                 self.resets.check_first(state.copy)
@@ -374,7 +382,8 @@ class Search:
         if is_over:
             if short not in self._ended and short not in self._by_copy and self.branching.sampling is None:
                 self._ended.add(short)
-                self._waiting_ends.append(self._copied())
+                if self._read is None or not len(self._ended) % SAMPLED:  # by the user's word it is all alike
+                    self._waiting_ends.append(self._copied())
             return OVER, seen
         if (state := self._by_copy.get(short)) is None:
             copy = self._copied() if self.ignore or self._read else key
@@ -415,6 +424,10 @@ class Search:
 
     def see(self, observation: Any) -> bytes:
         """A digest of an observation as a learner gets it, in the types of its space."""
+        may_be_met = type(observation) in (int, tuple, np.int64)
+        with contextlib.suppress(TypeError):  # of a tuple of what has no hash
+            if may_be_met and (met := self._met.get(observation)):
+                return met
         parts = list(leaves(observation, self.env.observation_space, self.refusal))  # whose sizes are known
         whole = b"".join(each.tobytes() if isinstance(each, np.ndarray) else each for each in parts)
         seen = whole if len(whole) <= 16 else hashlib.blake2b(whole, digest_size=17).digest()
@@ -423,4 +436,7 @@ class Search:
             shown = " ".join(str(observation).split())
             self.shown[seen] = f"observation {shown}" if len(shown) <= _LONGEST_NAME else ""
             self.budget.num_bytes += sum(each.nbytes for each in parts if isinstance(each, np.ndarray))
+        with contextlib.suppress(TypeError):
+            if may_be_met and all(isinstance(each, np.ndarray) for each in parts):  # by numbers alone
+                self._met[observation] = seen
         return seen

@@ -32,6 +32,8 @@ def walk(search: Search, kind: type, look: Callable[[], None] = lambda: None) ->
 def _steps(search: Search, kind: type, numbers: np.random.Generator) -> Iterator[Any]:
     yield search.see(search.layers.env.reset()[0])
     for _ in range(_WALK):
+        if search.layers.unread:  # whose stand-ins come with a copy
+            search.layers.put(search.layers.take())
         observation, reward, *over, _ = search.layers.env.step(kind(numbers.integers(search.num_actions)))
         yield search.see(observation), np.asarray(reward, np.float64).tobytes(), *map(bool, over)
         if any(over):

@@ -1,6 +1,7 @@
 """Environments as people have them become exact worlds: wrappers, memory, Dicts, clocks, batches, classes."""
 
 import enum
+import math
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -509,7 +510,7 @@ class OldStep(Line):
 class Endless(Line):
     def step(self, action: int) -> Result:
         self.count = getattr(self, "count", 0) + 1
-        return super().step(action)
+        return super().step(action if self.count > 0 else 0)
 
 
 REFUSED: dict[str, tuple[Any, str]] = {
@@ -797,6 +798,79 @@ def test_members_of_enumerations_are_state() -> None:
 
 
 DRAWING = np.random.default_rng(0)
+
+
+class Counting(Line):
+    """Counts and sums up, for `info` alone; `uses` may do more with a number than that."""
+
+    def __init__(self, uses: Callable[["Counting"], float] = lambda env: 0.0) -> None:
+        self.resets, self.steps, self.paid, self.uses = 0, 0, 0.0, uses
+
+    def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
+        self.resets, self.paid, self.lately = self.resets + 1, 0.0, np.float32(0)
+        return super().reset(**given)
+
+    def step(self, action: int) -> Result:
+        shown, reward, over, cut, _ = super().step(action)
+        self.steps += 1
+        self.paid = self.paid + reward
+        self.lately = np.float64(0.9) * self.lately + np.float32(reward)
+        reward += self.uses(self)
+        return shown, reward, over, cut, {"steps": self.steps, "sums": [self.paid, self.lately]}
+
+
+def test_what_is_only_counted_is_no_state() -> None:
+    env = Counting()
+    mdp = gridworld.compile_env(env)
+    assert mdp.digest() == gridworld.compile_env(Line()).digest()
+    assert (env.resets, env.steps) == (0, 0)
+    assert gridworld.compile_env(wrappers.TimeLimit(Counting(), 9)).max_episode_steps == 9
+
+
+# fmt: off
+USES: dict[str, Callable[[Counting], float]] = {
+    "compared": lambda env: float(env.steps > 12),
+    "compared seldom": lambda env: float(env.at == 2 and env.paid > 3),  # it is never more than 1
+    "as a truth": lambda env: 0.0 if env.steps else 1.0,
+    "as an index": lambda env: [0.0, 1.0][env.steps % 2],
+    "by numpy": lambda env: float(np.sqrt(env.steps)),
+    "in an array": lambda env: float(np.array([env.steps, 1.0]).sum()),
+    "by math": lambda env: math.sqrt(env.steps),
+    "as a float": lambda env: 0.1 * env.lately,
+    "as text": lambda env: float(len(f"{env.steps}")),
+    "by its type": lambda env: float(isinstance(env.steps, int)) * env.resets,
+    "in a set": lambda env: float(env.steps in {1, 2}),
+    "where it fails": lambda env: float("9"[env.steps - 1 if env.steps > 0 else 0 :] == "9"),
+}
+# fmt: on
+
+
+@pytest.mark.parametrize("use", USES)
+def test_a_count_that_is_read_is_state(use: str) -> None:
+    class Ending(wrappers.TimeLimit):  # of this class, so that its count is state
+        pass
+
+    def make() -> Any:
+        env = Counting(USES[use])
+        reset = env.reset
+
+        def anew(**given: Any) -> Any:
+            env.resets = env.steps = 0
+            return reset(**given)
+
+        env.reset = anew  # type: ignore[method-assign]
+        return Ending(env, 5)
+
+    mdp = gridworld.compile_env(make())
+    played, numbers = make(), np.random.default_rng(0)
+    for _ in range(30):
+        played.reset()
+        state, over = int(mdp.start_states[0]), False
+        while not over:
+            action = int(numbers.integers(2))
+            _, reward, terminated, truncated, _ = played.step(action)
+            assert mdp.reward[state, action, 0] == pytest.approx(float(reward), abs=1e-12)
+            state, over = int(mdp.next_state[state, action, 0]), terminated or truncated
 
 
 class Global(Coins):

@@ -512,7 +512,7 @@ UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
         "pays nan; must be a finite",
     ),
     "too many states": (
-        {"move": lambda s, a: (s.at + int(s.np_random.integers(2)), 0.0, False), "show": lambda s: 0},
+        {"move": lambda s, a: (s.at + int(s.np_random.integers(2)), 0.0, False), "show": lambda s: 0 * s.at},
         "more than 300 states",
     ),
 }
