@@ -25,6 +25,7 @@ LEAST_BEST = 0.99  # share of late steps with a best action
 PROBABILITY = 0.06  # tolerance of an action's
 _VISITED = 0.05  # share of steps; an actor-critic knows the values of the states that it is in
 _LIMIT = 20  # steps of an episode, unless the world says otherwise
+_SMALL = 8  # states of a world whose actions are named
 _LONGEST = 100  # steps that a policy is scored over
 # With this bonus the soft optimum of `DEAR_CONTEXTS` is right with probability 3/4. Its advantages then have
 # standard deviation 1, so that normalising them changes nothing.
@@ -170,7 +171,8 @@ def optimal(trained: Trained) -> str:
     score = Evaluator(mdp, trained.gamma, mdp.max_episode_steps or _LONGEST).score(trained.greedy)
     if not score.certified:
         actions = trained.greedy.argmax(axis=1)[mdp.reachable & ~mdp.terminal].tolist()
-        raise UnmetError(f"its best actions are {actions}, with regret {score.regret:.3g}")
+        best = f"its best actions are {actions}, with" if len(actions) <= _SMALL else "its best actions have"
+        raise UnmetError(f"{best} regret {score.regret:.3g}")
     return "optimal"
 
 
@@ -261,7 +263,7 @@ class Probe:
     @property
     def training(self) -> tuple[str, float, str]:
         """Probes with the same one share a training run."""
-        return self.world.name, self.gamma, repr(self.arguments)
+        return self.world.digest(), self.gamma, repr(self.arguments)
 
 
 _NO_EXPLORATION_LEFT = {"exploration_final_eps": 0.0}

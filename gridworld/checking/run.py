@@ -8,17 +8,23 @@ import textwrap
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from typing import Any
 
+from gridworld.base.bounds import STEP_LIMIT
 from gridworld.base.console import aligned
 from gridworld.base.errors import InputError, in_short
 from gridworld.checking.function import ReturnedError
-from gridworld.checking.probes import PROBES, Probe, UnknownError, UnmetError
+from gridworld.checking.probes import PROBES, Probe, UnknownError, UnmetError, optimal
 from gridworld.checking.training import build, settings, subject, train
+from gridworld.config.compose import named_world
 from gridworld.config.train import AgentConfig
+from gridworld.config.worlds import is_id
+from gridworld.envs.inspection import world_of
+from gridworld.world.mdp import Mdp
+from gridworld.world.sources.environment import make_env
 
 Outcomes = list[tuple[bool | None, str]]  # of one probe on each seed: see `Finding`
 SEEDS = 3  # of a probe that fails at first: it has failed if it fails on most of them
@@ -86,6 +92,7 @@ def check(
     *,
     observation: str = "state",
     steps: int | None = None,
+    worlds: Sequence[Any] = (),
 ) -> CheckResult:
     """Train an implementation on small worlds with known answers, and compare with the exact numbers.
 
@@ -108,6 +115,8 @@ def check(
         observation: what a function sees of a state: `state`, its number, or `one_hot`, a float32 vector.
         steps: environment steps of a training run; None: 20,000 of a function, as many as its kind needs of
             an agent.
+        worlds: worlds of your own on which its policy must become optimal too, at a discount of 0.99: what
+            `compile_env` takes, or compiled worlds. Give them enough `steps`.
 
     Returns:
         `passed`, `failed` (names), `findings` (a row for each probe); its text is the table.
@@ -133,6 +142,7 @@ def check(
         if name not in known:
             raise InputError(f"--probe {name}: no such probe; choose from {', '.join(known)}")
     chosen = [probe for probe in PROBES if not probes or probe.name in probes]
+    chosen += [_own_probe(world) for world in worlds]
     groups = [list(group) for _, group in itertools.groupby(chosen, lambda probe: probe.training)]
     if (first := settings(config, chosen[0], given)) is not None:
         try:  # what it refuses is the user's mistake, not a finding
@@ -147,6 +157,18 @@ def check(
             for finding in group:
                 on_finding(finding)
     return CheckResult(config.name, tuple(findings), time.monotonic() - started)
+
+
+def _own_probe(world: Any) -> Probe:
+    """Whether a policy becomes optimal in a world of the user's own."""
+    if isinstance(world, str):
+        mdp = world_of(partial(make_env, world)) if is_id(world) else named_world(world)
+    else:
+        mdp = world if isinstance(world, Mdp) else world_of(world)
+    limit = mdp.default_step_limit if mdp.max_episode_steps is None else mdp.max_episode_steps
+    name = world if isinstance(world, str) else mdp.name
+    meaning = "its policy is not optimal there: it may need more --steps or other settings, or be wrong"
+    return Probe(name, replace(mdp, max_episode_steps=limit or STEP_LIMIT), optimal, meaning, gamma=0.99)
 
 
 def _check_group(

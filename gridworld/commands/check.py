@@ -34,6 +34,7 @@ def main(words: Sequence[str]) -> None:
         options.processes,
         observation=options.observation,
         steps=options.steps,
+        worlds=options.world,
         on_finding=lambda finding: print(*map(printable, str(finding).splitlines()), sep="\n", flush=True),
     )
     print(printable(result.verdict()))
@@ -54,6 +55,8 @@ def _parser() -> argparse.ArgumentParser:
     argument = "an argument for it, e.g. learning_rate=0.001; may be repeated"
     option("--set", action="append", default=[], metavar="NAME=VALUE", help=argument)
     option("--probe", action="append", default=[], metavar="NAME", help="only this probe; may be repeated")
+    world = "a world of your own to be solved too, e.g. my_env:Tiny or four_rooms; may be repeated"
+    option("--world", action="append", default=[], metavar="NAME", help=world)
     shown = "what a train function sees of a state: its number, or a vector (default state)"
     option("--observation", choices=tuple(OBSERVATIONS), default="state", help=shown)
     option("--steps", type=whole(1), help="environment steps of a training run (default: 6,400 to 25,600)")

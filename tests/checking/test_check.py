@@ -153,6 +153,17 @@ def test_what_a_class_refuses_is_the_users_mistake() -> None:
         gridworld.check("sb3_contrib.RecurrentPPO", probes=["choice"])
 
 
+def test_worlds_of_ones_own_are_probes_too(capsys: pytest.CaptureFixture[str]) -> None:
+    lake = gridworld.compile_env("FrozenLake-v1")
+    result = gridworld.check("q_learning", probes=["choice"], worlds=["classic", lake], steps=100_000)
+    assert [each.name for each in result.findings] == ["choice", "classic", "FrozenLake-v1"]
+    assert result.findings[1].passed
+    command.main(["q_learning", "--processes", "1", "--probe", "choice", "--world", "CliffWalking-v1"])
+    assert "passed all 2 probes" in capsys.readouterr().out
+    with pytest.raises(InputError, match="no_such_world"):
+        gridworld.check("q_learning", worlds=["no_such_world"])
+
+
 def test_the_command_ends_with_0_or_1(capsys: pytest.CaptureFixture[str]) -> None:
     command.main(["q_learning", "--processes", "1", "--probe", "choice"])
     assert capsys.readouterr().out.splitlines()[-1].startswith("q_learning: passed all 1 probes, ")
