@@ -158,7 +158,19 @@ def test_worlds_of_ones_own_are_probes_too(capsys: pytest.CaptureFixture[str]) -
     result = gridworld.check("q_learning", probes=["choice"], worlds=["classic", lake], steps=100_000)
     assert [each.name for each in result.findings] == ["choice", "classic", "FrozenLake-v1"]
     assert result.findings[1].passed
-    command.main(["q_learning", "--processes", "1", "--probe", "choice", "--world", "CliffWalking-v1"])
+    command.main(
+        [
+            "q_learning",
+            "--processes",
+            "1",
+            "--probe",
+            "choice",
+            "--world",
+            "CliffWalking-v1",
+            "--steps",
+            "100000",
+        ]
+    )
     assert "passed all 2 probes" in capsys.readouterr().out
     with pytest.raises(InputError, match="no_such_world"):
         gridworld.check("q_learning", worlds=["no_such_world"])
