@@ -29,6 +29,7 @@ from gridworld.envs.observations import VectorOneHotObservation as VectorOneHotO
 from gridworld.envs.registration import ENV_ID as ENV_ID
 from gridworld.envs.registration import register_envs as register_envs
 from gridworld.envs.vector_env import GridWorldVectorEnv as GridWorldVectorEnv
+from gridworld.training.verify import verify as verify
 from gridworld.world.evaluation import Evaluator as Evaluator
 from gridworld.world.evaluation import Score as Score
 from gridworld.world.grid import compile_mdp as compile_mdp

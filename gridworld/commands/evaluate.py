@@ -18,6 +18,7 @@ from gridworld.training.saved_run import SavedRun, choose_policy
 from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.mdp import BY_CONSTRUCTION, FloatArray
 from gridworld.world.metrics import METRICS, optimal_score
+from gridworld.world.proof import at_most
 
 _MOST_EPISODES = 1_000_000
 
@@ -40,7 +41,9 @@ def main(arguments: Sequence[str]) -> None:
     with telling_if_slow(f"evaluating {options.run}"):
         score = evaluator.score(policy)
         sampled = sample_episodes(evaluator, policy, options.episodes, options.seed)
-        table, verdict = _table(evaluator, policy, score, sampled), "certified optimal"
+        table, proven = _table(evaluator, policy, score, sampled), score.proven_regret
+        how = "by floating point" if proven is None else f"the regret is at most {at_most(proven)}, proven"
+        verdict = f"certified optimal: {how}"
         if not score.certified:
             states = evaluator.endless_states(policy)
             names = [evaluator.mdp.state_name(state) for state in states[:MOST_NAMED]]

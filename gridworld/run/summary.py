@@ -113,7 +113,9 @@ def _trade(name: str, summary: Summary) -> str:
 def verdict(summary: Summary) -> str:
     """Whether the final greedy policy is optimal, in a sentence."""
     if summary["certified"]:
-        return f"certified optimal since step {summary['certified_since_step']:,}"
+        # Of earlier runs it is not known, and without a discount there is no proof.
+        floating = ", by floating point" if summary.get("proven_regret", "") is None else ""
+        return f"certified optimal since step {summary['certified_since_step']:,}{floating}"
     count, names = len(summary["endless_cells"]), summary["endless_states"]
     if summary["optimal_length"] >= summary["max_episode_steps"]:  # then the optimum does not end either
         count = 0

@@ -301,6 +301,7 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
         "gamma": config.evaluation.gamma,
         "max_episode_steps": evaluator.max_episode_steps,
         "certified": last.greedy.certified,
+        "proven_regret": last.greedy.proven_regret,
         "first_certified_step": certificate.first_certified_step,
         "certified_since_step": certificate.certified_since_step,
         "best_step": curve.best.step,

@@ -169,6 +169,15 @@ class Chain:
                 after[:] = backwards @ before
         return visits
 
+    @in_one_thread()
+    def total(self, counted: FloatArray, gamma: float) -> FloatArray:
+        """(S,), the expected discounted sum of numbers (S,) of at least 0, one for each state on the way."""
+        return self._sums(counted[:, None], gamma)[:, 0]
+
+    def expected_steps(self) -> FloatArray:
+        """(S,), how many steps an episode takes from a state on average; infinite where it may not end."""
+        return self.total((~self.mdp.absorbing).astype(np.float64), 1.0)
+
     def endless_states(self) -> IntArray:
         """(n,), ascending, where an episode may go on for ever: of a deterministic policy its cycle."""
         mdp = self.mdp

@@ -16,6 +16,7 @@ from gridworld.base.console import telling_if_slow
 from gridworld.base.errors import InputError
 from gridworld.world.chain import Chain, Outcome, one_hot_policy
 from gridworld.world.mdp import BY_CONSTRUCTION, FloatArray, IntArray, Mdp
+from gridworld.world.proof import Bounds
 from gridworld.world.solver import Solution, solved
 
 _USUAL_DISCOUNTS = (0.8, 0.9, 0.95, 0.97, 0.99)
@@ -23,6 +24,8 @@ _QUICKLY_SOLVED = 20_000  # outcomes of all states and actions: a few tenths of 
 # Relative to the optimum's discounted absolute rewards from the start; a detour of one step costs at least
 # 1 % at the default discount. Where the optimum earns and pays nothing, it is the rounding of a reward.
 REGRET_TOLERANCE = 1e-6
+# Discounts nearer to 1 than the first may leave a proof to rounding, than the second they do.
+HARDLY_PROVEN, NEAREST_PROVEN = 1 - 1e-8, 1 - 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +51,9 @@ class Score:
     certified: bool  # no policy is better
     outcome: Outcome  # of an episode within the step limit
     scope: str = BY_CONSTRUCTION  # how the world's tables are known
+    # Of a certified policy: its regret is at most this, by bounds that hold whatever rounding did. None: it
+    # is certified by floating point alone, as at a discount of 1.
+    proven_regret: float | None = None
 
     @property
     def shortfall(self) -> float:
@@ -91,6 +97,9 @@ class Evaluator:
         scale = self._at_start(self.solution.scale)
         self._earns_nothing = scale == 0
         self.tolerance = self._rounding() if self._earns_nothing else REGRET_TOLERANCE * scale
+        self.bounds: Bounds | None = None
+        if self.solution.gamma <= NEAREST_PROVEN:
+            self.bounds = Bounds(mdp, self.solution.gamma, self.solution.v, self.tolerance / 2)
         with telling_if_slow(f"following the optimum for up to {max_episode_steps:,} steps"):
             self.optimum: Outcome = Chain(mdp, self.optimal_policy()).outcome(max_episode_steps)
 
@@ -105,13 +114,23 @@ class Evaluator:
             InputError: it is no policy of this world.
         """
         chain = Chain(self.mdp, policy)
-        gamma = self.solution.gamma
-        # An optimum that earns nothing has no scale beside which a linear system's rounding is small.
-        values = chain.evaluation(gamma).value if self._earns_nothing else chain.value(gamma)
+        values = self.values(chain)
         value = self._at_start(values)
         regret = 0.0 if value == self.optimal_value else self.optimal_value - value  # both may be -inf
+        proven, certified = None, regret <= self.tolerance
+        if certified and self.bounds is not None:
+            proven = self.bounds.regret(self.bounds.lower(chain, values))
+            certified = proven <= self.tolerance
+            if not certified and self.solution.gamma > HARDLY_PROVEN:
+                proven, certified = None, True
         outcome = chain.outcome(self.max_episode_steps)
-        return Score(value, regret, regret <= self.tolerance, outcome, self.mdp.scope)
+        return Score(value, regret, certified, outcome, self.mdp.scope, proven)
+
+    def values(self, chain: Chain) -> FloatArray:
+        """V_π (S,) of the policy of a chain."""
+        gamma = self.solution.gamma
+        # An optimum that earns nothing has no scale beside which a linear system's rounding is small.
+        return chain.evaluation(gamma).value if self._earns_nothing else chain.value(gamma)
 
     def discounted_return(self, policy: FloatArray) -> float:
         """The exact expected discounted return of an episode within the step limit, of a policy (S, A)."""

@@ -1,0 +1,169 @@
+"""A certificate of a run's policy: all that proves how good it is, in one file that anybody can check.
+
+It has the world's rows, the policy, and bounds of what it and every policy are worth (`world.proof`). What
+checks it, `scripts/check_certificate.py`, imports nothing of this package and computes in exact fractions.
+"""
+
+from __future__ import annotations
+
+import gzip
+import importlib.util
+import json
+import math
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+import gridworld
+from gridworld.base.atomic_write import write_bytes
+from gridworld.base.errors import InputError
+from gridworld.training.saved_run import SavedRun
+from gridworld.world.chain import Chain, one_hot_policy
+from gridworld.world.evaluation import Evaluator, PolicySnapshot
+from gridworld.world.mdp import FloatArray, IntArray, Mdp, steps_from
+from gridworld.world.proof import at_most
+
+_MOST_EXACT = 1_000_000  # outcomes of all rows: about half a minute in fractions
+_ROUNDED = 12  # digits of values that may be meant as round numbers, without a discount
+_MORE = 1e-6  # of the expected steps to the end, which need only be a bound
+_CLAIM = (
+    "Under the discount gamma, the policy is worth at least the lower bounds where it goes, and no policy is "
+    "worth more than the upper bounds."
+)
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What is proven of a policy.
+
+    Attributes:
+        regret: no policy is worth more than this much more, from the start; infinite if nothing is proven.
+        is_optimal: whether that is within the tolerance of "certified optimal".
+        is_exact: whether it was checked in fractions; else by floats whose rounding is bounded.
+        certificate: the content of the certificate's file; empty if nothing is proven.
+    """
+
+    regret: float
+    is_optimal: bool
+    is_exact: bool
+    certificate: dict[str, Any] = field(repr=False)
+
+    def __str__(self) -> str:
+        """A sentence with the bound."""
+        if not self.certificate:
+            return "nothing is proven: at this discount its values are known by floating point alone"
+        found = self.certificate
+        how = "in exact fractions" if self.is_exact else "by floats whose rounding is bounded"
+        optimal = "optimal: " if self.is_optimal else ""
+        return (
+            f"{optimal}no policy is worth more than {at_most(self.regret)} more, proven {how} for "
+            f"{len(found['world']):,} states (rows {found['digest']})"
+        )
+
+    def write(self, path: Path) -> None:
+        """Write the certificate as JSON, compressed if the name ends with .gz."""
+        if not self.certificate:
+            raise InputError(f"{path}: not written, since {self}")
+        content = json.dumps(self.certificate).encode()
+        write_bytes(path, gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
+
+
+def verify(run: Any, out: str | PathLike[str] | None = None, *, best: bool = False) -> Verified:
+    """Prove how good a finished run's greedy policy is, with a certificate that anybody can check.
+
+    Args:
+        run: its folder, or an opened run. Its world is read from its own files, and none of its code is run.
+        out: a file for the certificate; compressed if its name ends with .gz.
+        best: whether to prove its best model, not its last one.
+
+    Returns:
+        `regret`, `is_optimal`, `is_exact`, and the `certificate`; its text is a sentence.
+
+    Raises:
+        InputError: no finished run; nothing is proven, and a file is asked for.
+    """
+    saved = SavedRun(Path(run), best=best) if isinstance(run, str | PathLike) else run.saved
+    snapshot: PolicySnapshot = saved.snapshot()
+    verified = proven(saved.evaluator(), snapshot.greedy)
+    if out is not None:
+        verified.write(Path(out))
+    return verified
+
+
+def proven(evaluator: Evaluator, greedy: IntArray) -> Verified:
+    """What can be proven of the policy that takes these actions (S,)."""
+    mdp, gamma = evaluator.mdp, evaluator.solution.gamma
+    chain = Chain(mdp, one_hot_policy(greedy, mdp.num_actions))
+    values, best, bounds = evaluator.values(chain), evaluator.solution.v, evaluator.bounds
+    candidates: list[tuple[FloatArray, FloatArray]] = []
+    if bounds is not None:
+        candidates.append((bounds.upper, bounds.lower(chain, values)))
+    elif gamma == 1:
+        candidates += [(best, values), (np.round(best, _ROUNDED), np.round(values, _ROUNDED))]
+    checker, size = _checker(), int(np.count_nonzero(mdp.probability[mdp.reachable]))
+    is_exact = bounds is None or size <= _MOST_EXACT
+    for upper, lower in candidates:
+        if not (np.isfinite(upper[mdp.reachable]).all() and np.isfinite(lower[mdp.reachable]).all()):
+            continue
+        found = _certificate(mdp, gamma, chain, greedy, upper, lower)
+        found["digest"] = checker.digest_of(found)
+        try:
+            if bounds is None or is_exact:
+                exact = checker.check(checker.parsed(json.dumps(found)))[0]
+            else:
+                exact = bounds.regret(lower)
+        except ValueError:
+            continue
+        regret = float(exact) if float(exact) >= exact else math.nextafter(float(exact), math.inf)
+        return Verified(regret, regret <= float(evaluator.tolerance), is_exact, found)
+    return Verified(math.inf, is_optimal=False, is_exact=False, certificate={})
+
+
+def _certificate(
+    mdp: Mdp, gamma: float, chain: Chain, greedy: IntArray, upper: FloatArray, lower: FloatArray
+) -> dict[str, Any]:
+    """The content of a certificate, without its digest."""
+    possible = mdp.probability > 0
+    taken = possible & (chain.policy > 0)[:, :, None]
+    live = mdp.reachable & ~mdp.terminal
+    entered = np.flatnonzero((steps_from(mdp.start_states, mdp.next_state, taken) >= 0) & live)
+    states, steps = np.flatnonzero(live).tolist(), {}
+    if gamma == 1 and lower[entered].max(initial=0.0) > 0:
+        ending = (1 + _MORE) * chain.expected_steps()
+        steps = {str(state): float(ending[state]) for state in entered.tolist()}
+    table = [mdp.probability.tolist(), mdp.next_state.tolist(), mdp.reward.tolist()]
+    world = {
+        str(state): [
+            [list(outcome) for outcome in zip(*row, strict=True) if outcome[0] > 0]
+            for row in zip(*(part[state] for part in table), strict=True)
+        ]
+        for state in states
+    }
+    return {
+        "claim": _CLAIM,
+        "scope": mdp.scope,
+        "gamma": gamma,
+        "start": [[state, float(mdp.start[state])] for state in mdp.start_states.tolist()],
+        "ended": np.flatnonzero(mdp.reachable & mdp.terminal).tolist(),
+        "world": world,
+        "policy": {str(state): int(greedy[state]) for state in entered.tolist()},
+        "upper": {str(state): float(upper[state]) for state in states},
+        "lower": {str(state): float(lower[state]) for state in entered.tolist()},
+        "steps": steps,
+    }
+
+
+def _checker() -> ModuleType:
+    """`check_certificate.py`, which is no part of the package: in an installed one, or in `scripts/`."""
+    package, name = Path(gridworld.__file__).parent, "check_certificate.py"
+    place = next(each for each in (package / name, package.parent / "scripts" / name) if each.exists())
+    spec = importlib.util.spec_from_file_location("check_certificate", place)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
