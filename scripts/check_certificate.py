@@ -3,7 +3,7 @@
 An action is worth q(x) = Σ p (r + γ x(next)), where x is 0 in what has ended. In all states let `upper` be at
 least q(upper) of every action, and where the policy goes `lower` at most q(lower) of its own. Then no policy
 earns more than `upper`, nor this one less than `lower`. At γ = 1 what never ends must be ruled out: no upper
-bound is below 0, or all that goes on costs; no lower bound is above 0, or `steps` bounds how long it goes on.
+bound is below 0, or all but ends costs; no lower bound is above 0, or the policy ends in `steps` on average.
 """
 
 import gzip
@@ -27,37 +27,45 @@ def once(pairs):
     return dict(pairs)
 
 
-def shares(rows, where):  # of a whole, to which floats add up but for rounding
-    total = sum((row[0] for row in rows), Fraction(0))
-    need(abs(total - 1) < ROUNDING and min(row[0] for row in rows) > 0, f"{where}: shares do not add up to 1")
-    return [(share / total, str(state), *paid) for share, state, *paid in rows]
+def checked(row, where):  # of probabilities, which add up to 1 but for rounding
+    need(abs(sum(p for p, *_ in row) - 1) < ROUNDING, f"{where}: its probabilities do not add up to 1")
+    need(min(p for p, *_ in row) > 0, f"{where}: a probability is not above 0")
+    return [(p + Fraction(0), str(state), *paid) for p, state, *paid in row]
+
+
+def mean(row, bound, gamma=1):
+    total = sum(p * (sum(paid) + gamma * bound.get(state, 0)) for p, state, *paid in row)
+    return total / sum(p for p, *_ in row)
 
 
 def check(given):
     """The regret from the start is at most the first, and the policy is worth at least the second."""
     need(sorted(given) == KEYS and 0 <= given["gamma"] <= 1, f"not the keys {KEYS}, or not a discount")
     gamma, policy, upper, lower = (given[name] for name in ("gamma", "policy", "upper", "lower"))
-    rows = {s: [shares(row, f"state {s}") for row in actions] for s, actions in given["world"].items()}
+    rows = {s: [checked(row, f"state {s}") for row in actions] for s, actions in given["world"].items()}
     ended = {str(state) for state in given["ended"]} - rows.keys()
-    start = shares([(share, state) for state, share in given["start"]], "start")
+    known, entered = ended | rows.keys(), ended | policy.keys()
+    start = checked([(p, state) for state, p in given["start"]], "start")
     need((upper.keys(), lower.keys()) == (rows.keys(), policy.keys()), "bounds: not of the states needed")
     for state, actions in rows.items():
-        need(ended | rows.keys() >= {s for row in actions for _, s, _ in row}, f"{state}: leads nowhere")
-        best = max(sum(p * (r + gamma * upper.get(s, 0)) for p, s, r in row) for row in actions)
+        need(known >= {s for row in actions for _, s, _ in row}, f"{state}: leads nowhere")
+        best = max(mean(row, upper, gamma) for row in actions)
         need(best <= upper[state], f"{state}: an action is worth more than the bound")
     for state, action in policy.items():
-        need(ended | policy.keys() >= {s for _, s, _ in rows[state][action]}, f"{state}: leads out of it")
-        own = sum(p * (r + gamma * lower.get(s, 0)) for p, s, r in rows[state][action])
+        need(entered >= {s for _, s, _ in rows[state][action]}, f"{state}: leads out of it")
+        own = mean(rows[state][action], lower, gamma)
         need(own >= lower[state] and action >= 0, f"{state}: the policy is worth less than its bound")
-    need(ended | policy.keys() >= {s for _, s in start}, "start: not where the policy acts")
+    need(entered >= {s for _, s in start}, "start: not where the policy acts")
     if gamma == 1:
         costs = (r < 0 for actions in rows.values() for row in actions for _, s, r in row if s not in ended)
         need(min(upper.values(), default=0) >= 0 or all(costs), "upper: proves nothing without a discount")
-        for s, a in policy.items() if max(lower.values(), default=0) > 0 else ():
-            left = sum(p * (0 if then in ended else given["steps"][then]) for p, then, _ in rows[s][a])
-            need(given["steps"][s] >= 1 + left, f"state {s}: the policy may go on for longer")
-    worth = sum(p * lower.get(s, 0) for p, s in start)
-    return sum(p * upper.get(s, 0) for p, s in start) - worth, worth
+    if gamma == 1 and max(lower.values(), default=0) > 0:
+        need(given["steps"].keys() == policy.keys(), "steps: not of the states where the policy acts")
+        for s, most in given["steps"].items():
+            left = mean([(p, then) for p, then, _ in rows[s][policy[s]]], given["steps"])
+            need(most >= 1 + left, f"state {s}: the policy may take longer")
+    worth = mean(start, lower)
+    return mean(start, upper) - worth, worth
 
 
 def parsed(text):

@@ -1,7 +1,7 @@
 """Prove how good a finished run's policy is, with a certificate that anybody can check.
 
 The certificate holds the world's rows, the policy, and bounds of what it and every policy are worth.
-`python3 -I scripts/check_certificate.py FILE` checks it in exact fractions with Python alone.
+`python3 -I check_certificate.py FILE` checks it in exact fractions with Python alone.
 Exit code: 0 if a bound is proven, 1 if none is, or not that a certified policy is optimal; 2 for a mistake.
 """
 

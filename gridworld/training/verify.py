@@ -21,6 +21,7 @@ import numpy as np
 import gridworld
 from gridworld.base.atomic_write import write_bytes
 from gridworld.base.errors import InputError
+from gridworld.base.user_input import as_path
 from gridworld.training.saved_run import SavedRun
 from gridworld.world.chain import Chain, one_hot_policy
 from gridworld.world.evaluation import Evaluator, PolicySnapshot
@@ -86,11 +87,13 @@ def verify(run: Any, out: str | PathLike[str] | None = None, *, best: bool = Fal
     Raises:
         InputError: no finished run; nothing is proven, and a file is asked for.
     """
-    saved = SavedRun(Path(run), best=best) if isinstance(run, str | PathLike) else run.saved
+    saved = getattr(run, "saved", None)
+    if saved is None or best:
+        saved = SavedRun(as_path("verify: run", getattr(run, "folder", run)), best=best)
     snapshot: PolicySnapshot = saved.snapshot()
     verified = proven(saved.evaluator(), snapshot.greedy)
     if out is not None:
-        verified.write(Path(out))
+        verified.write(as_path("verify: out", out))
     return verified
 
 
@@ -158,9 +161,10 @@ def _certificate(
 
 
 def _checker() -> ModuleType:
-    """`check_certificate.py`, which is no part of the package: in an installed one, or in `scripts/`."""
-    package, name = Path(gridworld.__file__).parent, "check_certificate.py"
-    place = next(each for each in (package / name, package.parent / "scripts" / name) if each.exists())
+    """`check_certificate.py`, which is no part of the package: beside an installed one, or in `scripts/`."""
+    around = Path(gridworld.__file__).parents[1]
+    places = (around / "gridworld_check_certificate.py", around / "scripts" / "check_certificate.py")
+    place = next(each for each in places if each.exists())
     spec = importlib.util.spec_from_file_location("check_certificate", place)
     assert spec is not None
     assert spec.loader is not None

@@ -26,7 +26,8 @@ TEXTS = (".py", ".md", ".yaml", ".toml", ".cff", ".j2")
 def test_a_command_for_each_script() -> None:
     for name in COMMANDS:
         assert f'call("{name}")' in (ROOT / "scripts" / f"{name}.py").read_text("utf-8")
-    assert len(list((ROOT / "scripts").glob("*.py"))) == len(COMMANDS)
+    files = {path.stem for path in (ROOT / "scripts").glob("*.py")}
+    assert files == {*COMMANDS, "check_certificate"}  # which needs nothing of the package
     assert conf_folder() == CONF
 
 
@@ -100,7 +101,7 @@ def test_nobody_is_sent_to_the_other_project_on_pypi() -> None:
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel, built from a copy of what it is made of."""
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
-    for name in ("gridworld", "conf"):
+    for name in ("gridworld", "conf", "scripts"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
@@ -127,6 +128,7 @@ def test_the_wheel_holds_what_it_takes_to_train(wheel: Path) -> None:
         "gridworld",
         "hydra_plugins",
         "pytest_gridworld.py",
+        "gridworld_check_certificate.py",
         f"gridworld_sb3-{__version__}.dist-info",
     }
 
@@ -150,6 +152,7 @@ def test_it_trains_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
     words = [*SHORT["q_learning"], "hydra.run.dir=run"]
     run(command, "train", *words)
     manifest = json.loads((here / "run" / "manifest.json").read_text())
+    assert "optimal" in run(command, "verify", "run")
     assert (manifest["git"], manifest["command"]) == (None, ["gridworld", "train", *words])
     assert manifest["versions"]["gridworld"] == __version__
     told = run(

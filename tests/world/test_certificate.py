@@ -292,12 +292,12 @@ def test_every_check_of_the_script_matters(holding: list[dict[str, Any]]) -> Non
         ("best <= upper[state]", "best <= upper[state] + 1"),
         ("own >= lower[state]", "own >= lower[state] - 1"),
         ("min(upper.values(), default=0) >= 0 or", "True or"), (">= 1 + left", ">= left"),
-        ("share / total", "share"), ("- rows.keys()", ""), ("max(sum(", "min(sum("),
-        ("if gamma == 1", "if False"), (" and action >= 0", ""), ("all(costs)", "True"),
-        ("if max(lower.values(), default=0) > 0 else ()", "if False else ()"),
+        ("- rows.keys()", ""), ("max(mean(", "min(mean("),
+        ("if gamma == 1:", "if False:"), (" and action >= 0", ""), ("all(costs)", "True"),
+        ("max(lower.values(), default=0) > 0", "False"),
         ('"parse_constant": Fraction', '"parse_constant": float'),
         ("<= 1, f", "<= 9, f"), ("0 <= given", "-9 <= given"),
-        (" and min(row[0] for row in rows) > 0", ""), ("abs(total - 1) < ROUNDING and", ""),
+        ("total / sum(p for p, *_ in row)", "total"),
     ]  # fmt: skip
     for old, new in swaps:
         assert source.count(old) == 1, old
