@@ -25,7 +25,7 @@ COMMANDS = {
     "train": "train an agent, resume a run, or run a sweep",
     "jobs": "show the status of a sweep's jobs",
     "evaluate": "score a finished run again, exactly and by sampling",
-    "verify": "prove how good a finished run is, by a certificate that anybody can check",
+    "verify": "prove how good finished runs are, by certificates that anybody can check",
     "diagnose": "explain why a finished run is not optimal, and what to try",
     "record": "draw a finished run's episodes and maps",
     "report": "compare many runs on one page",

@@ -1,8 +1,9 @@
-"""Prove how good a finished run's policy is, with a certificate that anybody can check.
+"""Prove how good the policies of finished runs are, by certificates that anybody can check.
 
-The certificate holds the world's rows, the policy, and bounds of what it and every policy are worth.
+A certificate holds the world's rows, the policy, and bounds of what it and every policy are worth.
 `python3 -I check_certificate.py FILE` checks it in exact fractions with Python alone.
-Exit code: 0 if a bound is proven, 1 if none is, or not that a certified policy is optimal; 2 for a mistake.
+Exit code: 0 if a bound is proven of every run; 1 if there is none of one, or a certified policy is not proven
+optimal; 2 for a mistake.
 """
 
 from __future__ import annotations
@@ -13,35 +14,51 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gridworld.base.console import printable, telling_if_slow
+from gridworld.base.errors import InputError
 from gridworld.base.user_input import limited
 from gridworld.commands import parser_of
+from gridworld.report.evidence import find_runs
 from gridworld.training.saved_run import SavedRun
-from gridworld.training.verify import proven
+from gridworld.training.verify import Verified, proven
 
 _NOT_PROVEN = 1  # the exit code
 
 
-@limited()
 def main(arguments: Sequence[str]) -> None:
-    """Print what is proven, and write the certificate."""
+    """Print what is proven of each run, and write the certificate of one."""
     options = _parser().parse_args(arguments)
-    with telling_if_slow(f"verifying {options.run}"):
-        saved = SavedRun(options.run, options.trust, options.best)
-        evaluator, claimed = saved.evaluator(), bool(saved.run.read_summary().get("certified"))
-        verified = proven(evaluator, saved.snapshot().greedy)
-    print(
-        printable(f"{options.run} on {evaluator.mdp.name}, discount {evaluator.solution.gamma:g}: {verified}")
-    )
-    print(printable(f"  world: {evaluator.mdp.scope}"))
+    folders, problems = find_runs(options.runs)
+    if problems:
+        raise InputError(problems[0])
+    if options.out is not None and len(folders) > 1:
+        raise InputError(f"--out {options.out}: is for one run, and there are {len(folders)}")
+    proofs = [_verified(folder, options) for folder in folders]
+    claimed = [verified for verified, is_certified in proofs if is_certified]
+    optimal = sum(verified.is_optimal for verified in claimed)
+    if len(proofs) > 1:
+        print(f"{optimal} of {len(claimed)} certified runs are proven optimal, of {len(proofs)} in all")
     if options.out is not None:
-        verified.write(options.out)
+        proofs[0][0].write(options.out)
         print(printable(f"  certificate: {options.out}"))
-    if not verified.certificate or (claimed and not options.best and not verified.is_optimal):
+    if optimal < len(claimed) or not all(verified.certificate for verified, _ in proofs):
         sys.exit(_NOT_PROVEN)
 
 
+@limited()
+def _verified(folder: Path, options: argparse.Namespace) -> tuple[Verified, bool]:
+    """What is proven of a run, which is printed, and whether it says that it is certified."""
+    with telling_if_slow(f"verifying {folder}"):
+        saved = SavedRun(folder, options.trust, options.best)
+        evaluator = saved.evaluator()
+        verified = proven(evaluator, saved.snapshot().greedy)
+    mdp, gamma = evaluator.mdp, evaluator.solution.gamma
+    print(printable(f"{folder} on {mdp.name}, discount {gamma:g}: {verified}"))
+    print(printable(f"  world: {mdp.scope}"), flush=True)
+    return verified, bool(saved.run.read_summary().get("certified")) and not options.best
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("verify", __doc__, "run", "--best", "--trust")
-    out = "a file for the certificate, JSON; compressed if it ends with .gz"
+    parser = parser_of("verify", __doc__, "runs", "--best", "--trust")
+    out = "a file for the certificate of the only run, JSON; compressed if it ends with .gz"
     parser.add_argument("--out", type=Path, metavar="FILE", help=out)
     return parser

@@ -21,7 +21,7 @@ import numpy as np
 import gridworld
 from gridworld.base.atomic_write import write_bytes
 from gridworld.base.errors import InputError
-from gridworld.base.user_input import as_path
+from gridworld.base.user_input import as_path, limited
 from gridworld.training.saved_run import SavedRun
 from gridworld.world.chain import Chain, one_hot_policy
 from gridworld.world.evaluation import Evaluator, PolicySnapshot
@@ -73,6 +73,7 @@ class Verified:
         write_bytes(path, gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
 
 
+@limited()
 def verify(run: Any, out: str | PathLike[str] | None = None, *, best: bool = False) -> Verified:
     """Prove how good a finished run's greedy policy is, with a certificate that anybody can check.
 

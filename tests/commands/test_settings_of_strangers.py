@@ -21,7 +21,7 @@ from helpers.support import CONF, NO_FILES, SHORT, configure, train_in
 
 import gridworld
 from gridworld.base.errors import InputError
-from gridworld.commands import diagnose, evaluate, export, play, playground, record, report, reproduce
+from gridworld.commands import diagnose, evaluate, export, play, playground, record, report, reproduce, verify
 from gridworld.commands.train import resume
 from gridworld.config import settings
 from gridworld.config.fields import MISSING
@@ -46,6 +46,8 @@ Place = tuple[str, Any]  # a setting's dotted name, and what a stranger writes t
 DOORS: dict[str, Callable[[Path], object]] = {
     "open_run": lambda run: gridworld.open_run(run).policy,
     "evaluate": lambda run: evaluate.main([str(run)]),
+    "verify": lambda run: verify.main([str(run), "--out", str(run.parent / "certificate.json")]),
+    "gridworld.verify": lambda run: gridworld.verify(run),
     "record": lambda run: record.main([str(run), "--format", "png", "policy"]),
     "report": lambda run: report.main([str(run), "--formats"]),
     "export": lambda run: export.main([str(run), "--to", "hub", "--out", str(run.parent / "hub")]),

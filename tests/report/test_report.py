@@ -113,6 +113,7 @@ def test_real_runs_are_reported(tmp_path: Path) -> None:
     for row in rows_of(folder / "tables" / "runs.csv"):
         summary = json.loads((tmp_path / "runs" / row["seed"] / "summary.json").read_text())
         assert float(row["regret"]) == pytest.approx(summary["regret"])
+        assert row["proven regret"] == str(summary["proven_regret"] or "")
         assert row["first certificate"] == str(summary["first_certified_step"] or "")
     page = (folder / "report.html").read_text()
     assert page.count('src="data:image/png;base64,') == 3  # the maps of the median seed

@@ -16,6 +16,7 @@ import pytest
 
 import gridworld
 from gridworld.base.errors import InputError
+from gridworld.commands import verify as command
 from gridworld.training.verify import Verified, _checker, proven
 from gridworld.world.evaluation import Evaluator
 
@@ -317,3 +318,21 @@ def test_a_run_is_verified_and_written(tmp_path: Path) -> None:
     assert run(tmp_path / "certificate.json.gz").returncode == 0
     with pytest.raises(InputError, match="nothing is proven"):
         Verified(np.inf, is_optimal=False, is_exact=False, certificate={}).write(tmp_path / "none.json")
+
+
+def test_the_command_verifies_several_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, steps in (("long", 4_000), ("short", 100)):
+        short = [f"total_timesteps={steps}", f"evaluation.every={steps}", "recording.frames=false"]
+        gridworld.train("agent=q_learning", *short, folder=tmp_path / "runs" / name, progress=False)
+    capsys.readouterr()
+    command.main([str(tmp_path / "runs")])
+    told = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(
+        r".*long on classic, discount 0.99: optimal: no policy is worth more than .*", told[0]
+    )
+    assert re.fullmatch(
+        r".*short on classic, discount 0.99: no policy is worth more than 0.9\d more, .*", told[2]
+    )
+    assert told[-1] == "1 of 1 certified runs are proven optimal, of 2 in all"
+    with pytest.raises(InputError, match="is for one run, and there are 2"):
+        command.main([str(tmp_path / "runs"), "--out", str(tmp_path / "certificate.json")])
