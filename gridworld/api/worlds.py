@@ -56,8 +56,9 @@ def evaluate(
         max_episode_steps: step limit of an episode; None: the environment's own, or 100.
 
     Returns:
-        Its `value`, `regret`, `certified`, and the `outcome` of an episode, which has the
-        probabilities of `goal`, `trap` and `timeout`, `expected_return` and `expected_length`.
+        Its `value`, `regret`, `certified`, `proven_regret` if it is certified, and the `outcome` of an
+        episode, which has the probabilities of `goal`, `trap` and `timeout`, `expected_return` and
+        `expected_length`.
 
     Raises:
         InputError: no world that is known exactly; a table

@@ -165,6 +165,9 @@ class Reader:
             command = [reads, *words, "--inspect"]  # reads the same, and ends
             return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, timeout=300)
         assert program == "python"
+        if words[0] == "-I":  # by Python alone
+            command = [sys.executable, "-I", str(ROOT / words[1]), *words[2:]]
+            return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, timeout=300)
         words[0] = words[0].removeprefix("scripts/")
         claims = self._claims_of(line)
         words = [*words, *claims[0][1]] if claims else shortened(words)

@@ -14,7 +14,7 @@ from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.proof import at_most
 
-WORLDS = 150
+WORLDS = 60
 
 
 def world(numbers: np.random.Generator, size: int, scale: float = 1.0) -> Mdp:

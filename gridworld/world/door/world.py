@@ -1,6 +1,7 @@
 """The world of an environment, by trying every action in a copy of every state.
 
     layers        what its wrappers and itself hold, copied and put back
+    unread        numbers that are counted and that nothing reads are no state
     search        the states, and what each action does there
     rejection     the generator in place of its own, which takes every outcome of every draw
     beliefs       what observations leave open of the state; states that are alike are one
