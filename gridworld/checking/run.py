@@ -13,7 +13,6 @@ from functools import partial
 from multiprocessing import get_context
 from typing import Any
 
-from gridworld.base.bounds import STEP_LIMIT
 from gridworld.base.console import aligned
 from gridworld.base.errors import InputError, in_short
 from gridworld.checking.function import ReturnedError
@@ -21,10 +20,7 @@ from gridworld.checking.probes import PROBES, Probe, UnknownError, UnmetError, o
 from gridworld.checking.training import build, settings, subject, train
 from gridworld.config.compose import named_world
 from gridworld.config.train import AgentConfig
-from gridworld.config.worlds import is_id
-from gridworld.envs.inspection import world_of
-from gridworld.world.mdp import Mdp
-from gridworld.world.sources.environment import make_env
+from gridworld.envs.inspection import task_of
 
 Outcomes = list[tuple[bool | None, str]]  # of one probe on each seed: see `Finding`
 SEEDS = 3  # of a probe that fails at first: it has failed if it fails on most of them
@@ -161,14 +157,11 @@ def check(
 
 def _own_probe(world: Any) -> Probe:
     """Whether a policy becomes optimal in a world of the user's own."""
-    if isinstance(world, str):
-        mdp = world_of(partial(make_env, world)) if is_id(world) else named_world(world)
-    else:
-        mdp = world if isinstance(world, Mdp) else world_of(world)
-    limit = mdp.default_step_limit if mdp.max_episode_steps is None else mdp.max_episode_steps
-    name = world if isinstance(world, str) else mdp.name
+    is_named = isinstance(world, str)
+    task = task_of(named_world(world) if is_named else world)
+    mdp = replace(task.mdp, max_episode_steps=task.max_episode_steps)
     meaning = "its policy is not optimal there: it may need more --steps or other settings, or be wrong"
-    return Probe(name, replace(mdp, max_episode_steps=limit or STEP_LIMIT), optimal, meaning, gamma=0.99)
+    return Probe(world if is_named else mdp.name, mdp, optimal, meaning, gamma=0.99)
 
 
 def _check_group(

@@ -42,9 +42,12 @@ def main(arguments: Sequence[str]) -> None:
         score = evaluator.score(policy)
         sampled = sample_episodes(evaluator, policy, options.episodes, options.seed)
         table, proven = _table(evaluator, policy, score, sampled), score.proven_regret
-        how = "by floating point" if proven is None else f"the regret is at most {at_most(proven)}, proven"
-        verdict = f"certified optimal: {how}"
-        if not score.certified:
+        if score.certified:
+            bound = (
+                "by floating point" if proven is None else f"the regret is at most {at_most(proven)}, proven"
+            )
+            verdict = f"certified optimal: {bound}"
+        else:
             states = evaluator.endless_states(policy)
             names = [evaluator.mdp.state_name(state) for state in states[:MOST_NAMED]]
             circles = circles_text(len(states), names, score.outcome.timeout)

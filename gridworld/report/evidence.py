@@ -62,9 +62,7 @@ class Evidence:
     pictures: Mapping[str, str]  # as `RunReader.pictures`
     step_limit: Any  # of an episode, as the summary has it
     privileges: Sequence[str]  # as `config.settings.privileges` finds them in its settings
-    proven_regret: (
-        float | None
-    )  # the final greedy policy's is at most this; None: not certified, or not proven
+    proven_regret: float | None  # at least the final greedy policy's; None: nothing is proven
     scope: str  # how the tables of its world are known; "" by construction
     damage: tuple[str, ...]  # a sentence for each of its other files that is not the one that it wrote
 

@@ -8,6 +8,7 @@ optimal; then no agent that learns perfectly with it can be certified.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -97,11 +98,14 @@ class Evaluator:
         scale = self._at_start(self.solution.scale)
         self._earns_nothing = scale == 0
         self.tolerance = self._rounding() if self._earns_nothing else REGRET_TOLERANCE * scale
-        self.bounds: Bounds | None = None
-        if self.solution.gamma <= NEAREST_PROVEN:
-            self.bounds = Bounds(mdp, self.solution.gamma, self.solution.v, self.tolerance / 2)
         with telling_if_slow(f"following the optimum for up to {max_episode_steps:,} steps"):
             self.optimum: Outcome = Chain(mdp, self.optimal_policy()).outcome(max_episode_steps)
+
+    @cached_property
+    def bounds(self) -> Bounds | None:
+        """Proven bounds of what policies are worth; None: the discount is too near to 1."""
+        found, gamma = self.solution, self.solution.gamma
+        return None if gamma > NEAREST_PROVEN else Bounds(self.mdp, gamma, found.v, self.tolerance / 2)
 
     def optimal_policy(self) -> FloatArray:
         """The policy (S, A) that takes the first of the optimal actions."""

@@ -50,14 +50,14 @@ class Bounds:
         self._live, self._starts = ~mdp.terminal, mdp.start_states
         self._share = mdp.start[self._starts] / mdp.start[self._starts].sum()
         self._states: IntArray = np.flatnonzero(mdp.reachable & self._live)
-        size, self._next = len(self._states), mdp.next_state[self._states]
+        size, following = len(self._states), mdp.next_state[self._states]
         paid, chance = mdp.reward[self._states], mdp.probability[self._states]
         self._weight = chance / chance.sum(axis=2, keepdims=True)
-        self._flat = self._next.reshape(size, 1, -1), -paid.reshape(size, 1, -1)
+        self._flat = following.reshape(size, 1, -1), -paid.reshape(size, 1, -1)
         self.upper = self._above(
             values,
             lambda actions: Chain(mdp, one_hot_policy(actions, mdp.num_actions)),
-            *(self._next, paid, self._weight),
+            *(following, paid, self._weight),
         )
 
     def lower(self, chain: Chain, values: FloatArray) -> FloatArray:

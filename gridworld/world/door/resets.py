@@ -12,7 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     from gridworld.world.door.search import Search
 
-FEW_STARTS, _SEEDS = 256, 100  # of more starts, those with so many seeds are compared
+_FEW_STARTS, _SEEDS = 256, 100  # of more starts, those with so many seeds are compared
 _MOST_RESETS = 1_000  # that lead to other states than usual; more will not turn out to be alike
 Start = tuple[Fraction, int, bytes]  # a probability, the number of a state, a digest of the observation
 
@@ -33,7 +33,7 @@ class Resets:
 
     def check(self, copy: bytes) -> None:
         """It must lead to the same, whatever it draws; of many outcomes, some that numpy draws are tried."""
-        if len(self.starts) > FEW_STARTS and all(map(partial(self._is_same, copy), range(_SEEDS))):
+        if len(self.starts) > _FEW_STARTS and all(map(partial(self._is_same, copy), range(_SEEDS))):
             return
         found = self._search.merged(partial(self._search.reset_from, copy))
         self._compare([each[:3] for each in self.starts], [each[:3] for each in found], copy)

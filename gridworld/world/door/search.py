@@ -157,9 +157,10 @@ class Search:
                 layers.put(self.begin)
                 layers.leave(changing)
                 try:
-                    if layers.unread and walk(self, np.int64) != as_sent:
-                        raise Read(layers.unread)
-                    layers.put(self.begin)
+                    if layers.unread:
+                        if walk(self, np.int64) != as_sent:
+                            raise Read(layers.unread)
+                        layers.put(self.begin)
                     self._explore(layers.limit)
                     layers.check_left()
                     layers.check_shared()
