@@ -80,7 +80,7 @@ IN_TURN = {
 LONG = (
     *("clusters", "tests/test_docs.py", "sources/test_chance.py", "commands/test_hostile_runs.py"),
     *("grading/test_course.py", "checking/test_functions.py", "docs/test_examples.py"),
-    *("diagnosis/test_sabotage.py", "api/test_certificates.py", "config/test_presets.py"),
+    *("diagnosis/test_sabotage.py", "api/test_certificates.py", "config/test_recipe_rule.py"),
     *("sweep/test_sweep_population.py", "sweep/test_sweep.py", "sources/test_enumerated.py"),
     *("tune/test_tune.py", "browsers", "playground", "config/test_recipes.py", "tune/test_tune_parts.py"),
     "engine/test_populations.py",

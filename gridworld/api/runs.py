@@ -27,6 +27,7 @@ from gridworld.base.signals import Interrupted
 from gridworld.base.user_input import as_path, limited
 from gridworld.config.compose import compose as compose_words
 from gridworld.config.train import TrainConfig
+from gridworld.config.worlds import World, each_once
 from gridworld.diagnosis import verdict
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.envs.rendering import Frame
@@ -183,17 +184,18 @@ def train(
         (True, (121, 4))
     """
     given = words(*overrides, **settings)
-    config = compose_words(given)
+    world = each_once()  # compiled for the choice of a recipe, and to train in
+    config = compose_words(given, world)
     if progress is not None:
         config.logging.progress = progress
     with _ONE_AT_A_TIME, _torch_threads_kept(), _as_python_interrupts(folder is not None):
         if folder is None:
-            return _train_without_files(config, given)
+            return _train_without_files(config, given, world)
         path = Path(folder).expanduser()
         check_free(path, "folder")
         try:
             with claimed(path.absolute()):
-                return _finished(path.absolute(), config, given, path)
+                return _finished(path.absolute(), config, given, path, world)
         except OSError as error:
             raise InputError(failure(error)) from None
 
@@ -270,7 +272,7 @@ def diagnose(
             return dataclasses.replace(found, tried=tuple(verdict.try_offers(saved, found, place, trust)))
 
 
-def _train_without_files(config: TrainConfig, given: list[str]) -> RunResult:
+def _train_without_files(config: TrainConfig, given: list[str], world: World) -> RunResult:
     plain = without_pictures(config)
     quiet = dataclasses.replace(
         plain,
@@ -278,17 +280,19 @@ def _train_without_files(config: TrainConfig, given: list[str]) -> RunResult:
         checkpoint=dataclasses.replace(plain.checkpoint, every=None),
     )
     with tempfile.TemporaryDirectory(prefix="gridworld-", ignore_cleanup_errors=True) as place:
-        result = _finished(Path(place), quiet, given, None)
+        result = _finished(Path(place), quiet, given, None, world)
     result.config = config
     return result
 
 
-def _finished(place: Path, config: TrainConfig, given: list[str], folder: Path | None) -> RunResult:
+def _finished(
+    place: Path, config: TrainConfig, given: list[str], folder: Path | None, world: World
+) -> RunResult:
     agents: list[Agent] = []
     if is_started(place):
-        unfinished_of(place, config).resume(on_built=agents.append)
+        unfinished_of(place, config, world).resume(on_built=agents.append)
     else:
-        train_in(config, place, given, on_built=agents.append)
+        train_in(config, place, given, world, on_built=agents.append)
     with limited(is_own=True):
         result = RunResult(SavedRun(place, trust=True), folder, agents.pop)
         _ = result.policy, result.evaluator  # before the model is trained further, or the folder is gone

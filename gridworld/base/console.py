@@ -226,12 +226,11 @@ class Progress(ProgressLine):
 
     def update(self, step: int, note: str) -> None:
         """Show that `step` steps are done; `note` says how it goes."""
-        total, now = self._total, time.monotonic()
+        total, now = max(self._total, step), time.monotonic()  # it trains by whole rollouts
         self._first = self._first if self._first[1] else (step, now)
         first, begun = self._first
         left = time_left(step - first, total - step, now - begun) if step < total else ""
-        share = min(step / total, 1.0)
-        self.show(lambda: f"{self._label}: step {step:,} of {total:,} ({share:.0%}), {note}{left}")
+        self.show(lambda: f"{self._label}: step {step:,} of {total:,} ({step / total:.0%}), {note}{left}")
 
 
 _is_telling: ContextVar[bool] = ContextVar("is_telling", default=False)

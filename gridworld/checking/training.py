@@ -139,7 +139,8 @@ def subject(algorithm: Any, observation: str = "state") -> AgentConfig:
     if "." in name:
         return SB3ClassConfig(name=name, algorithm=name, engine="stock")
     from gridworld.config.compose import compose
-    from gridworld.config.words import conf_folder, meant
+    from gridworld.config.messages import meant
+    from gridworld.config.words import conf_folder
 
     known = sorted(file.stem for file in (conf_folder() / "agent").glob("*.yaml"))
     if name not in known:

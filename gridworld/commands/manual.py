@@ -9,7 +9,7 @@ import textwrap
 from pathlib import Path
 
 from gridworld.base.console import as_called
-from gridworld.config.words import conf_folder, pairs
+from gridworld.config.words import conf_folder
 
 _TEXT = """\
 Train an agent on a GridWorld whose optimum is known exactly.
@@ -33,11 +33,11 @@ it had never been interrupted. Options of resume=RUN:
   trust=true              import classes from any package
   anyway=true             resume with other versions or on another processor; the last bits may differ
 
-Agents that were tuned for a world use the recipe automatically; the command line overrides it. tuned=none
-leaves recipes out, preset=none the settings for stochastic and for large worlds.
+An agent uses the recipe that was tuned for it in the world, or for stochastic or large worlds where it has
+none or the world is changed; the command line overrides it. tuned=none leaves recipes out.
 
-recipe=FILE uses what tune.py found: a study's folder, or the yaml file in it. It is read as data, so recipes
-from strangers are safe; the command line overrides them. --config-dir FOLDER adds your own yaml files; Hydra
+recipe=FILE uses what tune.py found: a study's folder, or the yaml file in it. It is read as data, so results
+of strangers are safe; the command line overrides them. --config-dir FOLDER adds your own yaml files; Hydra
 reads them, and they can run code.
 
 Sweeps (-m):
@@ -68,8 +68,8 @@ Hydra's own options: python scripts/train.py --hydra-help
 def manual() -> str:
     """The help text, with the choices in the folder of the yaml files."""
     conf, lines = conf_folder(), []
-    # Spaces are tune.py's, and settings are chosen by the names of the presets.
-    hidden = {conf, conf / "tune", conf / "preset" / "settings"}
+    # Spaces are tune.py's, and recipes are in a folder for each agent.
+    hidden = {conf, conf / "tune", *(conf / "tuned").iterdir()}
     for group in sorted({file.parent for file in conf.glob("**/*.yaml")} - hidden):
         lines.append(f"  {group.relative_to(conf).as_posix()}=...")
         lines += _recipes(group) if group.name == "tuned" else choices(group)
@@ -88,15 +88,13 @@ def choices(group: Path) -> list[str]:
 
 
 def _recipes(group: Path) -> list[str]:
-    """A line or two per world, then those that are known to fail."""
-    files = [file for file in sorted(group.glob("*.yaml")) if file.stem in pairs()]
-    agents: dict[str, list[str]] = {}
-    for file in files:
-        world, agent = pairs()[file.stem]
-        agents.setdefault(world, []).append(agent)
-    lines = []
-    for world, names in agents.items():
-        text = f"    {world + '_...':<22}  {', '.join(names)}"
-        lines += textwrap.wrap(text, 100, subsequent_indent=" " * 28)
-    failing = [file.stem for file in files if "known_failure:" in file.read_text("utf-8")]
-    return [*lines, f"    Known to fail: {', '.join(failing)}"] if failing else lines
+    """A line or two per agent, then those that are known to fail."""
+    lines = choices(group)
+    files = sorted(group.glob("*/*.yaml"))
+    for agent in sorted({file.parent.name for file in files}):
+        names = [file.stem for file in files if file.parent.name == agent]
+        text = f"    {agent + '/...':<18}  {', '.join(names)}"
+        lines += textwrap.wrap(text, 100, subsequent_indent=" " * 24)
+    failing = [file for file in files if "known_failure:" in file.read_text("utf-8")]
+    names = [file.relative_to(group).with_suffix("").as_posix() for file in failing]
+    return [*lines, f"    Known to fail: {', '.join(names)}"]

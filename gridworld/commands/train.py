@@ -32,15 +32,16 @@ from gridworld.base.errors import EXIT_CODE, InputError
 from gridworld.base.user_input import called_from, limited
 from gridworld.commands.manual import manual
 from gridworld.config.compose import VERSION_BASE, completed, refuse_unused, register_schemas, to_config
+from gridworld.config.messages import sentence, unreadable_file
+from gridworld.config.recipes import Chosen
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import (
     conf_folder,
     is_override,
     own_conf_folders,
     refuse_unclear,
-    sentence,
-    unreadable_file,
 )
+from gridworld.config.worlds import each_once
 from gridworld.run.folder import MANIFEST, SWEEP_JSON, alone_in, check_inside, claimed, shell_path
 from gridworld.run.reader import check_free, check_is, is_started
 
@@ -48,6 +49,7 @@ FULL_ERROR = "HYDRA_FULL_ERROR"
 _RESUME, _STEPS = "resume", "total_timesteps"
 _SWITCHES = {"logging.progress": "true", "trust": "false", "anyway": "false"}  # with their defaults
 _MOST_STEPS = 10**18
+_world = each_once()  # compiled for the choice of a recipe, and to train in
 _job_started = threading.Event()  # set when this process starts its first job
 _at_end = contextlib.ExitStack()  # lets go of a single run's folder, sums a sweep up
 
@@ -91,13 +93,13 @@ def _call_hydra() -> None:
 
 
 def _prepare_command_line() -> None:
-    """Write `sys.argv` as Hydra takes it: with the words of a recipe and a preset, and plain numbers."""
+    """Write `sys.argv` as Hydra takes it: with the words of a result and a recipe, and plain numbers."""
     refuse_unclear(sys.argv[1:])
     if any(word.startswith("recipe=") for word in sys.argv[1:]):
         from gridworld.config.recipe_file import with_recipe
 
         sys.argv[1:] = with_recipe(sys.argv[1:])
-    words = completed(sys.argv[1:])
+    words = completed(sys.argv[1:], _world)
     places = [at for at, _ in enumerate(words) if is_override(words, at)]
     if places and places[-1] - places[0] >= len(places):  # Hydra takes settings in one piece
         words = [*(words[at] for at in places), *(each for at, each in enumerate(words) if at not in places)]
@@ -136,7 +138,7 @@ class RefuseUsedFolders(Callback):
 
             # An interpolation may need what Hydra knows only in the job, where settings are compared again.
             with contextlib.suppress(OmegaConfBaseException):
-                unfinished_of(folder, to_config(copy.deepcopy(config)))
+                unfinished_of(folder, to_config(copy.deepcopy(config)), _world)
 
     @_exiting_on_mistake()
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -176,7 +178,7 @@ def run_job(settings: DictConfig) -> float:
     held = claimed(folder) if context.mode is RunMode.MULTIRUN else contextlib.nullcontext()
     # hydra.job.chdir=true changes the current folder
     with called_from(Path(context.runtime.cwd)), _exiting_on_mistake(), held:
-        return _train(to_config(settings), folder, overrides)
+        return _train(Chosen.of(context).settle(to_config(settings), overrides), folder, overrides)
 
 
 def _train(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
@@ -184,11 +186,11 @@ def _train(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
     from gridworld.run.summary import Summary, train_and_tell
     from gridworld.training.train import train
 
-    run: Callable[[], Summary] = partial(train, config, folder, overrides)
+    run: Callable[[], Summary] = partial(train, config, folder, overrides, _world)
     if is_started(folder):
         from gridworld.training.resume import unfinished_of
 
-        run = unfinished_of(folder, config).resume
+        run = unfinished_of(folder, config, _world).resume
     return float(train_and_tell(folder, run, partial(_advice, trust=True))["regret"])
 
 

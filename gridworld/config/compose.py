@@ -16,20 +16,20 @@ import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
-from hydra.types import RunMode
 from hydra.version import VersionBase
-from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf import DictConfig, OmegaConf, flag_override, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from gridworld.base.errors import InputError
-from gridworld.config.presets import may_need_preset, with_preset
+from gridworld.config.messages import meant, sentence
 from gridworld.config.recipe_file import literal, with_recipe
+from gridworld.config.recipes import Chosen, may_need_recipe, with_recipe_by_rule
 from gridworld.config.settings import agent_schemas
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SearchConfig, SweepConfig
 from gridworld.config.train import TrainConfig
-from gridworld.config.words import conf_folder, is_override, meant, own_conf_folders, prepared, sentence
-from gridworld.config.worlds import SOURCES, EnvConfig, GymnasiumConfig, MapConfig, is_id
+from gridworld.config.words import conf_folder, is_override, own_conf_folders, prepared
+from gridworld.config.worlds import SOURCES, EnvConfig, GymnasiumConfig, MapConfig, World, compiled, is_id
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
     from gridworld.world.mdp import Mdp
@@ -46,18 +46,18 @@ _NO_SINGLE_RUN = {  # with these of Hydra's options, a command line is not that 
 }
 
 
-def compose(words: Sequence[str]) -> TrainConfig:
+def compose(words: Sequence[str], world: World = compiled) -> TrainConfig:
     """Compose the configuration that a command line of these words would give to a run.
 
     It may have `--config-dir` and `recipe=`. It may be called in any thread, and in a program that uses Hydra
-    itself.
+    itself. `world` compiles the world, by which a recipe is chosen.
     """
     own = list(own_conf_folders(words))
     values = with_recipe([word for at, word in enumerate(words) if is_override(words, at)])
     try:
         with _leaving_hydra_as_it_was():
             _store_schemas()
-            return compose_run([*search_path(own), *values])[0]
+            return compose_run([*search_path(own), *values], world=world)[0]
     except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
         raise InputError(sentence(error)) from None
 
@@ -94,20 +94,24 @@ def compose_whole(name: str, words: Sequence[str]) -> DictConfig:
         return hydra.compose(name, prepared(words), return_hydra_config=True)
 
 
-def compose_run(words: Sequence[str], but: Collection[str] = ()) -> tuple[TrainConfig, DictConfig, list[str]]:
-    """Compose a run's settings with the preset that the world needs; Hydra's own part; the preset's words."""
+def compose_run(
+    words: Sequence[str], but: Collection[str] | None = (), world: World = compiled
+) -> tuple[TrainConfig, DictConfig, list[str]]:
+    """Compose a run's settings with the recipe that fits; Hydra's own part; the words that choose it.
+
+    A launcher that is not ours is refused, or one of `but`; None: it may be any.
+    """
     hydras: list[DictConfig] = []
 
-    def again(more: list[str]) -> TrainConfig:
+    def again(more: list[str]) -> tuple[TrainConfig, Chosen]:
         whole = compose_whole("train", [*words, *more])
+        if but is not None:
+            refuse_unused(whole.hydra, but)
         hydras.append(whole.hydra)
-        return to_config(whole)
+        return to_config(whole), Chosen.of(hydras[-1])
 
-    config, chosen = again([]), list[str]()
-    refuse_unused(hydras[0], but)
-    if hydras[0].mode is not RunMode.MULTIRUN:
-        config, chosen = with_preset(config, prepared(words), again)
-    return config, hydras[bool(chosen)], chosen
+    config, added = with_recipe_by_rule(prepared(words), again, world)
+    return config, hydras[-1 if added else 0], added
 
 
 def refuse_unused(own: DictConfig, but: Collection[str] = ()) -> None:
@@ -123,19 +127,23 @@ def refuse_unused(own: DictConfig, but: Collection[str] = ()) -> None:
             raise InputError(f"{word}{where}: {target} is not used here; choose from {', '.join(known)}")
 
 
-def completed(words: Sequence[str]) -> list[str]:
-    """A command line as Hydra takes it, with the words that choose the preset that a single run needs."""
+def completed(words: Sequence[str], world: World = compiled) -> list[str]:
+    """A command line as Hydra takes it, with the words that choose the recipe of a single run."""
     own = list(own_conf_folders(words))
-    found = prepared(words, own)
+    found = prepared(words)
     places = [number for number, _ in enumerate(found) if is_override(found, number)]
     values = [found[number] for number in places]
-    if {word.partition("=")[0] for word in found} & _NO_SINGLE_RUN or not (own or may_need_preset(values)):
+    if {word.partition("=")[0] for word in found} & _NO_SINGLE_RUN or not (own or may_need_recipe(values)):
         return found
-    chosen: list[str] = []
-    with contextlib.suppress(Exception):  # Hydra composes again, and says what is wrong
-        chosen = compose_run([*search_path(own), *values])[2]
+    added: list[str] = []
+    try:
+        added = compose_run([*search_path(own), *values], None, world)[2]
+    except InputError:
+        raise
+    except Exception:  # Hydra composes again, and says what is wrong
+        added = []
     end = places[-1] + 1 if places else len(found)  # options may follow
-    return [*found[:end], *chosen, *found[end:]]
+    return [*found[:end], *added, *found[end:]]
 
 
 def search_path(folders: Sequence[Path]) -> list[str]:
@@ -199,7 +207,10 @@ def register_schemas() -> None:
 @functools.cache  # they stay in Hydra's store
 def _store_schemas() -> None:
     store = ConfigStore.instance()
-    store.store(name="train_schema", node=TrainConfig(env=EnvConfig()))
+    run = cast(DictConfig, OmegaConf.structured(TrainConfig(env=EnvConfig())))
+    with flag_override(run, ["struct"], False):
+        run.pop("recipe")  # which no file and no word can set
+    store.store(name="train_schema", node=run)
     store.store(name="tune_schema", node=SearchConfig)
     store.store(group="hydra/sweeper", name="gridworld", node=SweepConfig)
     for name, launcher in LAUNCHER_SCHEMAS.items():

@@ -30,7 +30,8 @@ from gridworld.config.words import is_override
 KEY = "recipe"
 TRUST = "trust"
 IN_A_STUDY = ("experiment", "winner.yaml")
-CHOSEN = ("agent", "env", "observation", "preset", "tuned")
+CHOSEN = ("agent", "env", "observation", "tuned")
+_EARLIER = "preset"  # in studies of earlier versions; `prepared` reads it
 _LARGEST = 2**16  # bytes
 _DEEPEST = 20  # levels
 _CHOICE = re.compile(Text.CHOICE.value[0])
@@ -123,7 +124,8 @@ def _choices(defaults: Any, path: Path) -> Iterator[str]:
         if entry == "_self_":
             continue
         named = list(entry.items()) if isinstance(entry, dict) else []
-        groups = [group for group in CHOSEN if [f"override /{group}"] == [key for key, _ in named]]
+        known = (*CHOSEN, _EARLIER)
+        groups = [group for group in known if [f"override /{group}"] == [key for key, _ in named]]
         choice = named[0][1] if groups else None
         if not isinstance(choice, str) or not _CHOICE.fullmatch(choice):
             raise InputError(

@@ -22,7 +22,6 @@ from gridworld.config.fields import (
     MISSING,
     RATE,
     Callback,
-    ChoiceName,
     ClassPath,
     Contact,
     Effect,
@@ -207,10 +206,8 @@ class CheckpointConfig:
 class TrainConfig:
     """One training run."""
 
-    # the tuned settings of the agent in the world, a file in conf/tuned, that went into this; null: none
+    # the agent, or its recipe that went into this: AGENT/NAME, a file in conf/tuned (`config.recipes`)
     recipe: Word | None = setting(None, affects(Effect.NOTHING))
-    # of conf/preset, whose numbers went into this; auto: none was needed (`config.presets`)
-    preset: ChoiceName = setting("none", affects(Effect.NOTHING))
     # what came of these settings when they were tried, where they do not solve the task
     known_failure: Word | None = setting(None, affects(Effect.NOTHING))
     seed: int = setting(0, affects(Effect.SEED), bounds(0, 2**32 - 1))  # of all random numbers

@@ -1,78 +1,22 @@
-"""A command line: the yaml files that it chooses from, its words as Hydra takes them, and Hydra's errors.
-
-Hydra says what went wrong over several lines and advises to append an unknown key with `+`, which the
-schema would refuse as well. `sentence` keeps the fact, and adds what would have been right.
-"""
+"""A command line: the folders that it chooses from, its words as Hydra takes them, slips of the hand."""
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
 import functools
 import itertools
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from gridworld.base.bounds import digits
-from gridworld.base.errors import InputError, failure
+from gridworld.base.errors import InputError
 from gridworld.config.fields import MISSING
-from gridworld.config.settings import all_settings, settings_of_a_run, takes_whole_numbers
-from gridworld.config.train import AgentConfig
-from gridworld.config.worlds import EnvConfig, is_id
+from gridworld.config.settings import settings_of_a_run, takes_whole_numbers
+from gridworld.config.worlds import is_id
 
+CLASSES = ("stochastic", "large")  # of worlds, for which agents have recipes
 OF_THE_COMMAND = ("experiment", "recipe", "resume", "trust", "anyway")  # words that look like settings
 _FLOAT = re.compile(r"(?<![\w.$'\"])[-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.'\"])")
-_SENTENCES = (  # a pattern of a message of Hydra's: what is said instead
-    (
-        r"Config group override must be a string|^argument of type '\w+' is not iterable$",
-        "a choice must be a name, not null; write preset=none, tuned=none, or ~experiment",
-    ),
-    (
-        r"Interpolation key '([^']*)' not found",
-        "{}: is missing, but other settings refer to it; give it a value",
-    ),
-    (
-        r"Error resolving interpolation '\$\{env\}_\$\{agent\}'",
-        "agent and env: every run needs both; give agent=... and env=..., not ~agent or ~env",
-    ),
-    (
-        r"Multiple values for (\S+)\. To override a value use 'override \S+: (.*)'",
-        "+{0}={1}: {0} is always chosen, so it takes no plus; write {0}={1}",
-    ),
-    (r"Invalid plugin 'gridworld\.", "hydra/sweeper: another one needs hydra/launcher=basic, or its own"),
-)
-_HINTS = (  # a pattern of what is said: what would have been right
-    ("Ambiguous value", "; to run one job for each of the values, add -m"),
-    ("Could not append to config", "; leave out the plus"),
-    (
-        r"'\d+\.0' of type 'float' could not be converted to Integer",
-        "; in YAML, write whole numbers without a decimal point or exponent",
-    ),
-    (r"Value '\d+(\.\.|-)\d+'", "; a range, for -m, is range(1,6)"),
-    ("'[a-zA-Z]+' of type 'str' could not be converted to (Float|Integer)", "; must be a number"),
-    ("str is not a ListConfig", "; must be a list, such as [a,b]"),
-    (
-        r"'tune\.space.* not in struct|tune\.space=",
-        "; a search space is a yaml file in conf/tune, or in tune/ of --config-dir, chosen by tune=NAME",
-    ),
-    ("'SB3ClassConfig'", "; an argument of the class is written as +agent.arguments.gamma=0.9"),
-    ("'DimensionConfig'", "; a line of a search space is agent.gamma: {type: float, low: 0, high: 1}, say"),
-    ("'tune/.* in 'TuneConfig'", "; the first line of a search space is  # @package tune.space"),
-)
-_REWRITTEN = (  # a pattern of what is said: what is put in its place
-    (r"Could not override '(agent\.[^']*)': Key '[^']*' not in '(\w+)Config'", r"\1: no such setting of \2"),
-    (r"Could not override '([^']*)': Key '[^']*' not in '\w+'", r"\1: no such setting"),
-    (r"Could not override '([^']*)': Key '([^']*)' is not in struct", r"\1: has no \2"),
-    (r"^In '([^']+)': \w+ raised while composing config: ", r"\1.yaml: "),
-    (r"Key '([^']*)' not in '\w+'", r"\1: no such key"),
-    (
-        r": (mismatched input|no viable alternative|extraneous input|token recog).*",
-        ": is not valid syntax; is a comma, a bracket or a quotation mark missing or left over?",
-    ),
-    (r"^LexerNoViableAltException: (.*)", r"\1: a quotation mark has no partner"),
-)
-_LISTED = 24  # choices of a group that are listed at most; of more, those with a similar name
 _PACKAGE = Path(__file__).parents[1]
 _WITH_VALUE = (  # Hydra's options that the next word belongs to
     *("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--package", "-p"),
@@ -99,12 +43,11 @@ def is_override(words: Sequence[str], index: int) -> bool:
     return not words[index].startswith("-") and (index == 0 or words[index - 1] not in _WITH_VALUE)
 
 
-def prepared(words: Sequence[str], own: Sequence[Path] = ()) -> list[str]:
+def prepared(words: Sequence[str]) -> list[str]:
     """A command line as Hydra takes it: 1e5 as 100000, experiment=ENV_AGENT as the choice of the two.
 
-    An environment by its id, or by the name of its class, is the choice env=gymnasium with that id.
-
-    There may be recipes in the folders of `--config-dir` too, which are `own`.
+    An environment by its id, or by the name of its class, is the choice env=gymnasium with that id. A recipe
+    may be named as in earlier versions, tuned=ENV_AGENT or preset=CLASS; a class alone is that of the agent.
     """
     found: list[str] = []
     chosen = {word.lstrip("+").partition("=")[0] for word in words if "=" in word}
@@ -114,10 +57,11 @@ def prepared(words: Sequence[str], own: Sequence[Path] = ()) -> list[str]:
             raise InputError(f"{word}: a setting cannot be taken away; give it a value, {key[1:]}=...")
         if key == "env" and all(map(is_id, value.split(","))):
             found += ["env=gymnasium", f"env.id={value}"]
-            continue
-        if key == "tuned" and "hydra.searchpath" not in chosen:
-            _check_recipe(value, [conf_folder(), *own])
-        if key.lstrip("+") == "experiment" and value in pairs():
+        elif key == "tuned":
+            found.append(f"tuned={','.join(map(_recipe, value.split(',')))}")
+        elif key == "preset":
+            found += _of_preset(word, value, [each for each in words if each.startswith("tuned=")])
+        elif key.lstrip("+") == "experiment" and value in pairs():
             pair = zip(("env", "agent"), pairs()[value], strict=True)
             found += [f"{group}={name}" for group, name in pair if group not in chosen]
         elif takes_whole_numbers(key.lstrip("+")) and re.search(r"[.eE]", value):
@@ -127,13 +71,23 @@ def prepared(words: Sequence[str], own: Sequence[Path] = ()) -> list[str]:
     return found
 
 
-def _check_recipe(name: str, folders: Sequence[Path]) -> None:
-    """Refuse a missing recipe, which the defaults list would leave out without a word."""
-    known = sorted(file.stem for folder in folders for file in (folder / "tuned").glob("*.yaml"))
-    if re.fullmatch(r"\w+", name) and name not in known:
-        near = difflib.get_close_matches(name, known)
-        hint = f"; close matches: {', '.join(near)}" if near else ""
-        raise InputError(f"tuned={name}: no such recipe{hint}; --help lists them all")
+def _recipe(name: str) -> str:
+    """A recipe's name from one that may be of an earlier version, or of a class alone."""
+    if name in CLASSES:
+        return f"${{agent}}/{name}"
+    return "/".join(reversed(pairs()[name])) if name in pairs() else name
+
+
+def _of_preset(word: str, value: str, tuned: list[str]) -> list[str]:
+    """The words for a preset, which earlier versions had beside a recipe."""
+    if value in CLASSES and not set(tuned) - {"tuned=none"}:
+        return [f"tuned={_recipe(value)}"]
+    if value == "auto" or (value == "none" and tuned):
+        return []
+    raise InputError(
+        f"{word}: a preset is a recipe now; write tuned=none for the agent's own settings, or tuned=NAME for "
+        f"its recipe for a class of worlds, {' or '.join(CLASSES)}"
+    )
 
 
 @functools.cache
@@ -147,155 +101,42 @@ def pairs() -> dict[str, tuple[str, str]]:
 
 
 def refuse_unclear(words: Sequence[str]) -> None:
-    """Refuse settings that are written as options, `--seed 3`, in quotation marks, or without a key."""
+    """Refuse slips of the hand: settings as options, in quotation marks, with blanks, without a key."""
     known = {*OF_THE_COMMAND, *settings_of_a_run()}
+    groups = {file.name for file in conf_folder().iterdir() if file.is_dir()}
     for word, following in itertools.pairwise([*words, ""]):
         option, equals, value = word.partition("=")
-        name = option[2:].replace("-", "_")
-        if option.startswith("--") and (name in known or any(each.startswith(f"{name}.") for each in known)):
+        name = option.lstrip("-").replace("-", "_")
+        if name != option and (name in known or any(each.startswith(f"{name}.") for each in known)):
             takes_next = not equals and following and not following.startswith("-") and "=" not in following
             given = f"{word} {following}" if takes_next else word
             value = (following if takes_next else value) or "VALUE"
             raise InputError(f"{given}: a setting is written without dashes; write {name}={value}")
+        if option == "config-dir":
+            raise InputError(f"{word}: is an option; write --{word}")
+    for folder in own_conf_folders(words):
+        if folder.name in groups and not any((folder / group).is_dir() for group in groups):
+            raise InputError(
+                f"--config-dir={folder}: give the folder above it, which has a folder {folder.name}"
+            )
     for index, word in enumerate(words):
         if not is_override(words, index):
             continue
         if word[:1] in ("'", '"'):
             raise InputError(f"{word}: is in quotation marks, which the shell passed on; leave them out")
+        rest = list(itertools.takewhile(lambda each: not each.startswith("-"), words[index:]))
+        if rest[1:2] == ["="] or (word[-1:] == "=" and rest[1:] and "=" not in rest[1]):
+            count = 3 if rest[1] == "=" else 2
+            raise InputError(f"{' '.join(rest[:count])}: has blanks; write {''.join(rest[:count])}")
+        if word.endswith(",") and rest[1:]:
+            values = [word, *itertools.takewhile(lambda each: "=" not in each, rest[1:])]
+            ends = next((n for n, each in enumerate(values, 1) if not each.endswith(",")), len(values))
+            line = "".join(values[:ends]).rstrip(",")
+            line = line if "-m" in words else f"-m {line}"
+            raise InputError(f"{' '.join(values[:ends])}: has blanks after commas; write {line}")
         if "=" not in word and not word.startswith("~"):
-            groups = ("agent", "env", "observation", "preset", "experiment")
-            found = [each for each in groups if (conf_folder() / each / f"{word}.yaml").is_file() and word]
-            wanted = (
-                f"write {found[0]}={word}" if found else "a setting is written key=value, as in agent=dqn"
-            )
+            files = [conf_folder() / group / f"{word}.yaml" for group in sorted(groups)]
+            found = [f"{file.parent.name}={word}" for file in files if file.is_file() and word]
+            wanted = "a setting is written key=value, as in agent=dqn"
+            wanted = f"write {[*found, '--help'][0]}" if found or word == "help" else wanted
             raise InputError(f"{word or 'an empty word'}: is not a setting; {wanted}")
-
-
-def sentence(error: BaseException) -> str:
-    """Put the facts of an exception, Hydra's or any other, into one line."""
-    message = str(error)
-    if isinstance(error, InputError):
-        return message
-    if isinstance(error, OSError) and error.strerror:
-        return failure(error)
-    if (mark := getattr(error, "problem_mark", None)) is not None:  # of yaml
-        problem = getattr(error, "problem", None)
-        return f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is not valid YAML: {problem}"
-    if missing := re.search(r"[Mm]issing mandatory value: (\S+)", message):
-        key = missing[1] if "." in missing[1] else getattr(error, "full_key", None) or missing[1]
-        word = "" if key.startswith("tune.space.") else f"give {key}=..., or "
-        return f"{key}: has no value; {word}set it in a yaml file"
-    for pattern, words in _SENTENCES:
-        if found := re.search(pattern, message):
-            return words.format(*found.groups())
-    if "Could not find" in message and "Available options in" in message:
-        return _unknown_choice(message)
-    lines = message.splitlines() or [type(error).__name__]
-    facts = lines[: 2 if lines[0].endswith(":") or lines[0].startswith("Error parsing") else 1]
-    facts[0] = facts[0].removeprefix("Error merging override ").removeprefix("Error parsing override ")
-    facts += str(error.__cause__ or "").splitlines()[:1]
-    override = getattr(error, "override", None)
-    if override and override not in facts[0]:
-        facts.insert(0, override)
-    text = ": ".join(fact.strip().rstrip(".:") for fact in facts)
-    for pattern, words in _REWRITTEN:
-        text = re.sub(pattern, words, text)
-    return text + _suggestion(" ".join(facts), message, error)
-
-
-def unreadable_file(error: Exception, folders: Iterable[Path]) -> str:
-    """A sentence on the first yaml file that raises an error like this one, for which Hydra names no file.
-
-    It is a `UnicodeDecodeError` or a `RecursionError`.
-    """
-    from omegaconf import OmegaConf  # here, since --help takes no longer than it must
-
-    for file in sorted(file for folder in folders for file in folder.rglob("*.yaml")):
-        try:
-            OmegaConf.load(file)
-        except type(error) as found:
-            if isinstance(found, UnicodeDecodeError):
-                return f"{file}: byte {found.start + 1} is not UTF-8"
-            return f"{file}: is nested too deeply, or contains itself"
-        except Exception:
-            continue  # which would name its file itself
-    return sentence(error)
-
-
-def _unknown_choice(message: str) -> str:
-    missing = re.search(r"Could not find '([^']*)'", message)
-    group = re.search(r"Available options in '([^']*)':((?:\n\t\S+)*)", message)
-    assert missing is not None
-    choices = group.group(2).split() if group else []
-    where, _, name = missing.group(1).rpartition("/")
-    if group and missing.group(1).startswith(f"{group.group(1)}/"):
-        where, name = group.group(1), missing.group(1)[len(group.group(1)) + 1 :]
-    if where == "experiment":
-        choices = sorted({*choices, *pairs()})
-    fact = f"{where}={name}: no such choice"
-    if len(choices) <= _LISTED:
-        return f"{fact}; choose from {', '.join(choices)}{meant(name, choices)}"
-    near = [choice for choice in choices if choice.startswith(name)]
-    near = near or difflib.get_close_matches(name, choices)
-    hint = f"; close matches: {', '.join(near)}" if near else ""
-    return f"{fact}{hint}; --help lists them all"
-
-
-def _suggestion(facts: str, message: str, error: BaseException) -> str:
-    for pattern, hint in _HINTS:
-        if re.search(pattern, facts):
-            return hint
-    if added := re.search(r"Could not override '([^']*)'.*Key '([^']*)' is not in struct", facts, re.DOTALL):
-        place, name = added.groups()
-        entry = place if place.endswith(f".{name}") else f"{place}.{name}"
-        return f"; a new entry of a dictionary needs a plus: +{entry}=..."
-    if unknown := re.search(r"Key '([^']*)' not in '\w+'", facts):
-        if unknown[1] == "tune":
-            return "; that is a setting of tune.py"
-        place = re.search(r"full_key: (\S+)", message + facts) or re.search(r"override '([^']*)'", facts)
-        return _alike((place or unknown)[1], unknown[1], _not_chosen(error))
-    return ""
-
-
-def _not_chosen(error: BaseException) -> set[str]:
-    """The settings of other agents and worlds than those in which OmegaConf found an error."""
-    from omegaconf import DictConfig, OmegaConf  # here, since --help takes no longer than it must
-
-    found = (getattr(each, "parent_node", None) for each in (error, error.__cause__))
-    nodes = [each for each in found if isinstance(each, DictConfig)]
-    others = set[str]()
-    for section, schema in (("agent", AgentConfig), ("env", EnvConfig)):
-        for node in (*nodes, *(node[section] for node in nodes if section in node)):
-            kind = OmegaConf.get_type(node)
-            if isinstance(kind, type) and issubclass(kind, schema):
-                own = {field.name for field in dataclasses.fields(kind)}
-                places = (name.split(".") for name in all_settings())
-                others |= {".".join(name) for name in places if name[0] == section and name[1] not in own}
-    return others
-
-
-def _alike(name: str, key: str, others: set[str]) -> str:
-    """The settings in the section of `name` that look like `key`, or else those in other sections."""
-    known = {*all_settings(), *OF_THE_COMMAND} - {name} - others
-    section = name.rpartition(".")[0]
-    own = [each[len(section) + bool(section) :] for each in known if each.startswith(section)]
-    if near := meant(key, sorted({each.partition(".")[0] for each in own} - {key})):
-        return near
-    last = {each: each.rpartition(".")[2] for each in known if each.partition(".")[0] != section}
-    alike = _similar(key, sorted(set(last.values())), n=1, cutoff=0.8)
-    return _or(sorted(each for each, part in last.items() if [part] == alike)) or "; --cfg job shows all keys"
-
-
-def meant(key: str, known: list[str]) -> str:
-    """The names that `key` looks like, is the initials or the end of, as a question; "" if there is none."""
-    longer = [name for name in known if name.endswith(key) and len(key) > 3]
-    return _or(_similar(key, known) or longer)
-
-
-def _similar(key: str, known: list[str], n: int = 3, cutoff: float = 0.6) -> list[str]:
-    initials = [name for name in known if "_" in name and "".join(w[:1] for w in name.split("_")) == key]
-    return initials or difflib.get_close_matches(key.lower(), known, n, cutoff)
-
-
-def _or(names: list[str]) -> str:
-    return f"; did you mean {' or '.join(names)}?" if names else ""

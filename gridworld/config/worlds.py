@@ -19,6 +19,7 @@ from gridworld.base.errors import InputError
 from gridworld.config.fields import (
     MISSING,
     BuilderPath,
+    ChoiceName,
     Effect,
     EnvId,
     FilePath,
@@ -43,16 +44,13 @@ class EnvConfig:
 
     # the step limit; null: the world's own, or 100
     max_episode_steps: int | None = setting(None, bounds(1, MOST_STEPS))
+    # worlds of conf/env whose recipes are used where an agent has none of its own for this one
+    recipes_of: list[ChoiceName] = setting(list, affects(Effect.NOTHING))
 
     @property
     def name(self) -> str:
         """What folders and messages call the world."""
         raise NotImplementedError
-
-    @property
-    def compiles_quickly(self) -> bool:
-        """Whether it may be compiled while settings are composed: soon, and without code of the user's."""
-        return not isinstance(self, EnumeratedConfig | BuiltConfig)
 
     def compile(self) -> Mdp:
         """Compile the world."""
@@ -120,15 +118,6 @@ class GymnasiumConfig(EnvConfig):
     def name(self) -> str:
         place, colon, name = self.id.rpartition(":")
         return f"{Path(place).stem if place.endswith('.py') else place}{colon}{name}"
-
-    @property
-    def compiles_quickly(self) -> bool:
-        if ":" in self.id or not super().compiles_quickly:
-            return False
-        from gridworld.world.sources.environment import make_env
-        from gridworld.world.sources.gymnasium_table import has_table
-
-        return has_table(make_env(self.id, self.kwargs).unwrapped)
 
     def compile(self) -> Mdp:
         from gridworld.world.sources.elsewhere import same_elsewhere
@@ -212,7 +201,7 @@ class ClassicConfig(EnvConfig):
         from gridworld.world.sources import classics
 
         sizes = asdict(self)
-        del sizes["source"], sizes["max_episode_steps"]
+        del sizes["source"], sizes["max_episode_steps"], sizes["recipes_of"]
         make: Callable[..., Mdp] = getattr(classics, self.source)
         try:
             return make(**sizes)
@@ -269,9 +258,25 @@ def is_id(text: str) -> bool:
     return re.search(r"(-v\d+|[\w.]:[A-Za-z_]\w*)$", text) is not None
 
 
+World = Callable[[EnvConfig], "Mdp"]  # makes the world of these settings
+
+
 def compiled(env: EnvConfig) -> Mdp:
     """The world of these settings."""
     return env.compile()
+
+
+def each_once() -> World:
+    """`compiled`, for one command: equal settings are compiled once."""
+    worlds: dict[str, Mdp] = {}
+
+    def world(env: EnvConfig) -> Mdp:
+        key = repr(env)
+        if key not in worlds:
+            worlds[key] = env.compile()
+        return worlds[key]
+
+    return world
 
 
 def schema_of(content: Any) -> type[EnvConfig]:

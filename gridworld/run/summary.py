@@ -87,9 +87,7 @@ def summary_text(summary: Summary, folder: str, advice: Sequence[str] = ()) -> s
 
 def _made_of(summary: Summary) -> str:
     """Where its settings come from, if not from the agent alone."""
-    recipe, preset = summary["recipe"], summary["preset"]
-    parts = [f"recipe {recipe}"] if recipe is not None else []
-    return "".join(f", {part}" for part in [*parts, *([f"preset {preset}"] if preset != "none" else [])])
+    return "" if summary["recipe"] is None else f", recipe {summary['recipe']}"
 
 
 def _rows(summary: Summary, within_limit: bool) -> list[list[str]]:

@@ -130,7 +130,7 @@ def _result(folder: Path) -> _Result | None:
         words = {}
         for word in run.manifest["overrides"]:
             key = word.partition("=")[0].lstrip("+~").partition("@")[0]
-            if key == "preset" or effect_of(key) in _OF_SETTINGS:
+            if effect_of(key) in _OF_SETTINGS:
                 follows = "${" in word and key in settings  # from other settings, as `n_envs=${seed}` does
                 words[key] = f"{key}={settings[key]}" if follows else word
         return _Result(run.read_summary(), settings, words)

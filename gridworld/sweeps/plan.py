@@ -31,11 +31,11 @@ from gridworld.base.errors import InputError
 from gridworld.base.processes import file_limit, free_memory, worker_count
 from gridworld.base.together import LARGEST
 from gridworld.config.compose import drop_hydra, to_config
-from gridworld.config.presets import with_preset
+from gridworld.config.recipes import Chosen, with_recipe_by_rule
 from gridworld.config.settings import foreign, has_own_code
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.config.words import prepared
-from gridworld.config.worlds import EnvConfig
+from gridworld.config.worlds import each_once
 from gridworld.run.provenance import settings_hash
 from gridworld.training.setup import check_settings, notes
 from gridworld.world.mdp import Mdp
@@ -170,22 +170,23 @@ class Configurations:
         self._base = functools.lru_cache(maxsize=_MOST_BASES)(self._by_hydra)
         self._is_group = functools.cache(lambda key: bool(loader.get_group_options(key)))
 
-    def __call__(self, words: Sequence[str]) -> TrainConfig:
+    def __call__(self, words: Sequence[str]) -> tuple[TrainConfig, Chosen]:
         """Compose a job's overrides."""
         overrides = OverridesParser.create(config_loader=self._loader).parse_overrides(prepared(words))
         rest = [each for each in overrides if not self._is_choice(each)]
         own = [place for place, override in enumerate(rest, 1) if not _is_value(override)]
         ours = rest[max(own, default=0) :]  # Hydra applies values in their order, after all choices
         lines = [str(each.input_line) for each in overrides if each not in ours]
-        settings = copy.deepcopy(self._base(*lines))
+        base, chosen = self._base(*lines)
+        settings = copy.deepcopy(base)
         try:
             for override in ours:
                 OmegaConf.update(settings, override.key_or_group, override.value())
         except OmegaConfBaseException:
-            settings = self._by_hydra(*(str(each.input_line) for each in overrides))  # says what is wrong
-        return to_config(settings)
+            settings, _ = self._by_hydra(*(str(each.input_line) for each in overrides))  # says what is wrong
+        return to_config(settings), chosen
 
-    def _by_hydra(self, *words: str) -> DictConfig:
+    def _by_hydra(self, *words: str) -> tuple[DictConfig, Chosen]:
         whole = self._loader.load_sweep_config(self._master, list(words))
         for key, value in _shared(whole).items():
             if value != self._shared[key]:
@@ -193,7 +194,8 @@ class Configurations:
                     f"hydra.{key}: is set by only some of the jobs, but all jobs of a sweep share it; give "
                     "it on the command line"
                 )
-        return drop_hydra(whole)
+        chosen = Chosen.of(whole.hydra)
+        return drop_hydra(whole), chosen
 
     def _is_choice(self, override: Override) -> bool:
         return self._is_group(override.key_or_group) and not isinstance(override.value(), dict)
@@ -213,17 +215,12 @@ def _shared(whole: DictConfig) -> dict[str, Any]:
 
 
 def plan(
-    jobs: Iterable[tuple[list[str], list[str]]], configure: Callable[[Sequence[str]], TrainConfig]
+    jobs: Iterable[tuple[list[str], list[str]]],
+    configure: Callable[[Sequence[str]], tuple[TrainConfig, Chosen]],
 ) -> list[Job]:
     """Compose and check the jobs, each once; `jobs` has (overrides, the swept ones among them) of each."""
-    worlds: dict[str, Mdp] = {}
+    world = each_once()
     known: dict[str, tuple[str, ...]] = {}  # notes
-
-    def world(env: EnvConfig) -> Mdp:
-        key = repr(env)
-        if key not in worlds:
-            worlds[key] = env.compile()
-        return worlds[key]
 
     def noted(config: TrainConfig, mdp: Mdp) -> tuple[str, ...]:
         key = repr(dataclasses.replace(config, seed=0))
@@ -234,10 +231,10 @@ def plan(
     planned: dict[str, Job] = {}
     for given, swept in jobs:
 
-        def compose(words: list[str], given: list[str] = given) -> TrainConfig:
+        def compose(words: list[str], given: list[str] = given) -> tuple[TrainConfig, Chosen]:
             return configure([*given, *words])
 
-        config, chosen = with_preset(compose([]), given, compose, world)
+        config, added = with_recipe_by_rule(prepared(given), compose, world)
         said: tuple[str, ...] = ()
         mistake, layout, memory = None, "", 0
         try:
@@ -247,7 +244,7 @@ def plan(
         except InputError as error:
             mistake = str(error)
         digest = settings_hash(dataclasses.asdict(config), layout)
-        job = Job((*given, *chosen), tuple(swept), digest, mistake, config, memory, said)
+        job = Job((*given, *added), tuple(swept), digest, mistake, config, memory, said)
         first = planned.setdefault(digest, job)
         if other := [word for word in swept if word not in first.swept]:
             shown = " ".join(word for word in first.swept if word not in swept)

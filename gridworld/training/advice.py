@@ -12,8 +12,8 @@ import numpy as np
 
 from gridworld.base.console import aligned, command
 from gridworld.base.errors import InputError
-from gridworld.config.presets import fitting_preset, is_world
-from gridworld.config.train import AUTO, TrainConfig
+from gridworld.config.recipes import GROUP, agent_and_recipe, is_world, recipe_of_class
+from gridworld.config.train import TrainConfig
 from gridworld.config.words import conf_folder
 from gridworld.run.folder import SWEEP_JSON, RunFolder, shell_path
 from gridworld.run.reader import RunReader, read_columns
@@ -22,7 +22,7 @@ from gridworld.training.saved_run import SavedRun
 _FALLS = 0.95  # of the regret in the quarter of the curve before the last
 _FEWEST = 8  # evaluations
 _WHY = "why it is not optimal:"
-_REPLACED = ("total_timesteps", "n_envs", "preset", "tuned")
+_REPLACED = ("total_timesteps", "n_envs", GROUP)
 
 
 def advice(folder: Path, trust: bool = False) -> list[str]:
@@ -49,13 +49,16 @@ def _commands(saved: SavedRun, place: str) -> Iterator[list[str]]:
     """(why, command) of what may help."""
     run, config = saved.run, saved.config
     words = [word for word in saved.overrides if _key(word) not in _REPLACED]
-    is_open = config.recipe is None and not saved.omission  # then words of its command line are missing
-    if is_open and (env := _world_with_recipe(config)) is not None:
+    agent, recipe = agent_and_recipe(config.recipe or "")
+    is_open = recipe is None and not saved.omission  # then words of its command line are missing
+    if is_open and (env := _world_with_recipe(agent, config)) is not None:
         own = [word for word in words if _key(word).partition(".")[0] not in ("env", "experiment", "agent")]
-        yield ["its recipe:", _train([f"agent={config.agent.name}", f"env={env}", *own])]
-    elif is_open and config.preset in (AUTO, "none") and "experiment" not in map(_key, words):
-        preset = fitting_preset(config, lambda: saved.mdp)
-        yield from [[f"for {preset} worlds:", _train([*words, f"preset={preset}"])]] if preset else []
+        yield ["its recipe:", _train([f"agent={agent}", f"env={env}", *own])]
+    elif is_open and "experiment" not in map(_key, words):
+        fitting = recipe_of_class(agent, config, lambda: saved.mdp)
+        if fitting is not None:
+            kind = fitting.rpartition("/")[2]
+            yield [f"for {kind} worlds:", _train([*words, f"{GROUP}={fitting}"])]
     yield [_WHY, f"{command('diagnose')} {place}"]
     if not (run.folder.parent / SWEEP_JSON).exists() and _still_falls(run):  # a job's length is the sweep's
         resume = run.resume_command(dataclasses.asdict(config))
@@ -70,11 +73,10 @@ def _key(word: str) -> str:
     return word.lstrip("+~").partition("=")[0]
 
 
-def _world_with_recipe(config: TrainConfig) -> str | None:
+def _world_with_recipe(agent: str, config: TrainConfig) -> str | None:
     """The name in `conf/env` of the run's world, if the agent has a recipe for it."""
-    ending = f"_{config.agent.name}.yaml"
-    names = (recipe.name.removesuffix(ending) for recipe in (conf_folder() / "tuned").glob(f"*{ending}"))
-    return next((env for env in sorted(names) if is_world(config.env, env)), None)
+    files = sorted((conf_folder() / GROUP / agent).glob("*.yaml"))
+    return next((file.stem for file in files if is_world(config.env, file.stem)), None)
 
 
 def _still_falls(run: RunReader) -> bool:

@@ -132,7 +132,7 @@ def repeat(
     overrides = then.manifest.get("overrides") or []
     logging = dataclasses.replace(config.logging, wandb=False)
     config = dataclasses.replace(config, total_timesteps=first, logging=logging)
-    own = training(config, folder, overrides, lambda env: mdp)
+    own = training(config, folder, overrides, lambda env: mdp, is_trusted=False)
     if begun := find_run(folder):
         if members:
             raise InputError(
@@ -171,7 +171,7 @@ def _again(run: RunReader, place: Path, like: TrainConfig, trust: bool) -> Train
     )
     mdp, folder = stored_world(run, config.env), place / run.folder.name
     folder.mkdir()
-    return training(config, folder, [], lambda env: mdp)
+    return training(config, folder, [], lambda env: mdp, is_trusted=False)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from gridworld.base.serialization import State, StateError
 from gridworld.config.fields import Use, falls
 from gridworld.config.settings import flat, foreign
 from gridworld.config.train import TrainConfig
-from gridworld.config.worlds import EnvConfig, MapConfig, compiled
+from gridworld.config.worlds import MapConfig, World, compiled
 from gridworld.run.checkpoints import MOST_STEPS, Checkpoints, steps_of
 from gridworld.run.folder import CHECKPOINTS, CURVE
 from gridworld.run.provenance import environment, git, identity, settings, source_differences
@@ -50,7 +50,7 @@ def open_unfinished(folder: Path, trust: bool = False) -> Unfinished:
 
 
 def unfinished_of(
-    folder: Path, config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled, trust: bool = True
+    folder: Path, config: TrainConfig, world: World = compiled, trust: bool = True
 ) -> Unfinished:
     """Read the unfinished run of these settings, to resume it with them; refused if its own differ."""
     unfinished = open_unfinished(folder, trust)  # its classes are those of `config`, or it is refused

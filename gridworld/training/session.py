@@ -26,8 +26,9 @@ from gridworld.base.errors import InputError
 from gridworld.base.serialization import State, fitting, npy_bytes
 from gridworld.base.signals import StopRequest
 from gridworld.base.together import clock
+from gridworld.config.recipes import agent_and_recipe
 from gridworld.config.settings import privileges
-from gridworld.config.train import AUTO, TrainConfig
+from gridworld.config.train import TrainConfig
 from gridworld.run.checkpoints import Checkpoints, Pace
 from gridworld.run.folder import CURVE, EVENTS
 from gridworld.run.provenance import environment, identity
@@ -293,8 +294,7 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
         "scope": mdp.scope + ("" if acts_by is None else f"; actions are what {acts_by}.predict answers"),
         "observation": config.observation.kind,
         "seed": config.seed,
-        "recipe": config.recipe,
-        "preset": config.preset if config.preset != AUTO else "none",
+        "recipe": agent_and_recipe(config.recipe or "")[1],
         "privileges": privileges(dataclasses.asdict(config)),
         "total_timesteps": config.total_timesteps,
         "timesteps": last.step,

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from importlib.util import find_spec
 
 from gridworld.agents import TrainingContext, WriteScalars
 from gridworld.base.errors import InputError, install_command
-from gridworld.config.presets import LARGE, STOCHASTIC, fitting_preset, is_recipe_for
-from gridworld.config.train import AUTO, PICTURES, TrainConfig, check
-from gridworld.config.worlds import EnvConfig, compiled
+from gridworld.config.recipes import recipe_note
+from gridworld.config.train import PICTURES, TrainConfig, check
+from gridworld.config.worlds import World, compiled
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
@@ -20,7 +19,7 @@ from gridworld.world.mdp import Mdp
 _QUICKLY_SOLVED = 6000  # outcomes of all states and actions
 
 
-def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled) -> Mdp:
+def check_settings(config: TrainConfig, world: World = compiled) -> Mdp:
     """Check everything that can be checked without the agent's library; returns the run's world."""
     check(config)
     config.agent.check(config)
@@ -88,20 +87,7 @@ def without_pictures(config: TrainConfig) -> TrainConfig:
 
 def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
     """What a user should know of the settings before training: where they come from, what they cannot do."""
-    steps, otherwise = f"{config.total_timesteps:,} steps", "keeps the agent's own settings"
-    size = f"{mdp.name} has {mdp.num_states:,} states"
-    why = f"{mdp.name} is stochastic" if mdp.is_stochastic else size
-    found = []
-    if config.recipe is not None:
-        is_its = is_recipe_for(config.recipe, config.agent.name, config.env)
-        elsewhere = "" if is_its else ", tuned in another world"
-        found.append(f"recipe {config.recipe}{elsewhere}: {steps}; tuned=none {otherwise}")
-    elif config.preset == AUTO and (fitting := fitting_preset(config, lambda: mdp)) is not None:
-        found.append(
-            f"{why}: preset={fitting} is meant for that, but is left out because of the given settings"
-        )
-    if config.preset in (STOCHASTIC, LARGE):
-        found.append(f"{why}: preset={config.preset}, {steps}; preset=none {otherwise}")
+    found = [] if (recipe := recipe_note(config, mdp)) is None else [recipe]
     if config.known_failure is not None:
         found.append(f"agent={config.agent.name} is known to fail: {config.known_failure}")
     note = objective_note(config, mdp)

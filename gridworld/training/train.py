@@ -18,7 +18,7 @@ from gridworld.base.errors import FolderLostError, InputError, MachineError, rea
 from gridworld.base.serialization import State, StateError
 from gridworld.base.signals import Interrupted
 from gridworld.config.train import TrainConfig
-from gridworld.config.worlds import EnvConfig, compiled
+from gridworld.config.worlds import World, compiled
 from gridworld.run.folder import MANIFEST, RunFolder, shown
 from gridworld.run.reader import is_started
 from gridworld.run.summary import Summary, interruption_text
@@ -33,14 +33,16 @@ def training(
     config: TrainConfig,
     folder: Path,
     overrides: list[str],
-    world: Callable[[EnvConfig], Mdp] = compiled,
+    world: World = compiled,
     on_built: OnBuilt = ignore,
+    is_trusted: bool = True,
 ) -> Training[Summary]:
     """Train, evaluate and record as configured; the manifest says that the command line changed `overrides`.
 
     `world` makes the configured world, or returns an existing one; `on_built` takes the agent before it
-    learns. A mistake in the settings is an `InputError` before anything is written; so is a divergence.
-    Raises `MachineError` where files cannot be written, and `Interrupted` after a signal and a checkpoint.
+    learns; `is_trusted` is whether the environment that the settings name may be made. A mistake in the
+    settings is an `InputError` before anything is written; so is a divergence. Raises `MachineError` where
+    files cannot be written, and `Interrupted` after a signal and a checkpoint.
     """
     with TrainLog() as log:
         mdp = check_settings(config, world)
@@ -51,7 +53,7 @@ def training(
         if is_empty:
             tell(f"{manifest}: is empty, so nothing of the run was saved; it starts over")
         begin = partial(RunWriter.start, folder, dataclasses.asdict(config), mdp, overrides, replace=is_empty)
-        return (yield from carry_out(config, folder, mdp, begin, log, world is compiled, on_built=on_built))
+        return (yield from carry_out(config, folder, mdp, begin, log, is_trusted, on_built=on_built))
 
 
 train = alone(training)

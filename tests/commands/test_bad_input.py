@@ -22,7 +22,7 @@ from hydra.errors import HydraException
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import sealed
 from gridworld.commands.train import FULL_ERROR
-from gridworld.config.words import sentence
+from gridworld.config.messages import sentence
 from gridworld.training.train import train
 
 YAMLS: dict[str, bytes] = {
@@ -52,6 +52,7 @@ MAPS = {
 # What the command line itself, Hydra or a file of the user's makes of it; the rest are settings that compose.
 OF_THE_COMMAND = re.compile(
     r"--|hydra\.|recipe=|\{conf\}|~|^[^=]*$|^\S+=\S+ \w+$|['\"]|=null|=\[1|env=gymnasium|seed=(1,2|-1)"
+    r"|^-|^config-dir|=? = ?|= \w|^preset"
 )
 ANY_CLASS = " ".join(any_class("stable_baselines3.A2C"))
 REFUSED = table("commands/bad_input.txt", "train.py")

@@ -202,12 +202,14 @@ def test_no_recipe_chooses_a_file_elsewhere(mark: Path) -> None:
     """Hydra would read it, with interpolations and all."""
     (mark.parent / "evil.yaml").write_text("# @package _global_\ncallbacks: [{_target_: evil.Mark}]\n")
     recipe = mark.parent / "winner.yaml"
-    recipe.write_text(f"preset: {'../' * 20}{mark.parent}/evil\n")
+    elsewhere = f"{'../' * 20}{mark.parent}/evil"
+    recipe.write_text(f"env: {{recipes_of: [{elsewhere}]}}\n")
     with pytest.raises(InputError, match="leads out of the folder of choices; add trust=true"):
         gridworld.compose(f"recipe={recipe}")
-    recipe.write_text("preset: [{a: b}]\n")
-    with pytest.raises(InputError, match=r"preset=.* must be the name of a choice"):
-        gridworld.compose(f"recipe={recipe}")
+    for content in (f"defaults: [{{override /tuned: {elsewhere}}}]\n", f"tuned: {elsewhere}\n"):
+        recipe.write_text(content)
+        with pytest.raises(InputError, match=r"a recipe chooses|has an unknown key 'tuned'"):
+            gridworld.compose(f"recipe={recipe}")
 
 
 def test_a_resumed_run_that_contacts_a_server_needs_trust(good: Path, mark: Path) -> None:

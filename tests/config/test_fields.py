@@ -62,7 +62,7 @@ def used(*words: str) -> list[str]:
 def test_privileges_are_those_that_are_declared() -> None:
     for agent in AGENTS:
         plans = [PLANS] if agent == "value_iteration" else []
-        assert used(f"agent={agent}") == used(f"agent={agent}", "env.slip=0.1", "preset=none") == plans
+        assert used(f"agent={agent}") == used(f"agent={agent}", "env.slip=0.1", "tuned=none") == plans
         exploring = used(f"agent={agent}", "exploring_starts=0.1", "stratified_draws=true")
         assert exploring == ["starts anywhere", "stratified draws", *plans]
 

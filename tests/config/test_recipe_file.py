@@ -47,13 +47,22 @@ def of_words(*words: str) -> TrainConfig:
 def test_a_winner_is_the_same_by_hydra_and_as_data(agent: str, tmp_path: Path) -> None:
     register_schemas()
     choices = {"agent": agent, "env": "cliff", "observation": "coordinates" if agent == "ppo" else "one_hot"}
-    choices |= {"preset": "stochastic" if agent == "ppo" else "none"}
-    choices |= {"tuned": "none" if agent == "ppo" else f"cliff_{agent}"}
+    choices |= {"tuned": f"{agent}/{'stochastic' if agent == 'ppo' else 'cliff'}"}
     words = [*(f"{group}={choice}" for group, choice in choices.items()), *WINNERS[agent]]
     path = write_recipe(tmp_path, (), choices, configure(*words), "a winner")
     by_hydra, *_ = compose_run(["experiment=winner", *search_path([tmp_path])])
     assert of_words(f"recipe={path}") == by_hydra == configure(*words)
     assert of_words(f"recipe={tmp_path}") == configure(*words)
+
+
+@pytest.mark.parametrize(
+    ("preset", "tuned", "recipe"),
+    [("none", "cliff_dqn", "dqn/cliff"), ("stochastic", "none", "dqn/stochastic")],
+)
+def test_a_result_of_an_earlier_version(preset: str, tuned: str, recipe: str, tmp_path: Path) -> None:
+    lines = [f"- override /preset: {preset}", f"- override /tuned: {tuned}", "seed: 7"]
+    config = of_words(a_recipe(tmp_path, "dqn", "\n".join(lines)))
+    assert (config.recipe, config.seed) == (recipe, 7)
 
 
 def a_recipe(folder: Path, agent: str, settings: str) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import stable_baselines3
+import yaml
 from helpers.support import CONF, NO_FILES, configure, script, train_in
 
 from gridworld.agents.sb3.factory import algorithm_and_arguments
@@ -16,40 +17,49 @@ from gridworld.commands.manual import manual
 from gridworld.config.train import check
 from gridworld.config.words import pairs
 
-RECIPES = sorted(file.stem for file in (CONF / "tuned").glob("*.yaml") if file.stem != "none")
+RECIPES = sorted(
+    (file.stem, file.parent.name)
+    for file in (CONF / "tuned").glob("*/*.yaml")
+    if file.stem not in ("stochastic", "large")
+)
 STUDIES = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))
-PAIRS = {f"{env}_{agent}": (env, agent) for env, agent in pairs().values()}
 # One for each agent, in a small world.
-TRAINED = {PAIRS[recipe][1]: recipe for recipe in RECIPES if recipe.startswith(("aima", "four"))}
+TRAINED = {agent: env for env, agent in RECIPES if env in ("aima_4x3", "four_rooms")}
 
 
 def test_an_agent_in_a_world_brings_its_recipe() -> None:
-    for recipe in RECIPES:
-        env, agent = PAIRS[recipe]
+    assert {(env, agent) for env, agent in RECIPES} <= set(pairs().values())
+    for env, agent in RECIPES:
         config = configure(f"env={env}", f"agent={agent}")
         check(config)
         config.agent.check(config)
-        assert (config.recipe, config.preset, config.agent.name) == (recipe, "auto", agent)
-        text = (CONF / "tuned" / f"{recipe}.yaml").read_text("utf-8")
+        assert (config.recipe, config.agent.name) == (f"{agent}/{env}", agent)
+        text = (CONF / "tuned" / agent / f"{env}.yaml").read_text("utf-8")
         assert text.startswith("# @package _global_\n# certified on ")
-        assert f"\nrecipe: {recipe}\n" in text
 
 
-@pytest.mark.parametrize("recipe", TRAINED.values())
-def test_a_recipe_trains(recipe: str, tmp_path: Path) -> None:
+def test_no_recipe_repeats_another() -> None:
+    """What several worlds have in common is said in `recipes_of`."""
+    contents = [
+        (agent, yaml.safe_load((CONF / "tuned" / agent / f"{env}.yaml").read_text("utf-8")))
+        for env, agent in RECIPES
+    ]
+    assert [each for place, each in enumerate(contents) if each in contents[:place]] == []
+
+
+@pytest.mark.parametrize(("agent", "env"), TRAINED.items())
+def test_a_recipe_trains(agent: str, env: str, tmp_path: Path) -> None:
     """Long enough for a first update: past learning_starts, and through a rollout."""
-    summary = train_in(tmp_path, f"experiment={recipe}", "total_timesteps=200", *NO_FILES)
-    assert summary["recipe"] == recipe
+    summary = train_in(tmp_path, f"experiment={env}_{agent}", "total_timesteps=200", *NO_FILES)
+    assert summary["recipe"] == f"{agent}/{env}"
     assert int(summary["timesteps"]) >= 200
-    env, agent = PAIRS[recipe]
-    assert configure(f"experiment={recipe}") == configure(f"env={env}", f"agent={agent}")
-    without = configure(f"env={env}", f"agent={agent}", "tuned=none", "preset=none")
-    assert without.recipe is None
+    assert configure(f"experiment={env}_{agent}") == configure(f"env={env}", f"agent={agent}")
+    assert configure(f"env={env}", f"agent={agent}", "tuned=none").recipe == agent
 
 
 def test_settings_are_plain_values() -> None:
     """What is left of interpolations names files and folders, in train.yaml and for Hydra."""
-    groups = ("agent", "env", "observation", "preset", "tuned")
+    groups = ("agent", "env", "observation", "tuned")
     files = [file for group in groups for file in (CONF / group).rglob("*.yaml")]
     assert [file for file in files if "${" in file.read_text("utf-8")] == []
 
@@ -62,14 +72,14 @@ def test_the_command_line_beats_the_recipe_and_the_recipe_the_agent() -> None:
     assert recipe.total_timesteps != plain.total_timesteps
     assert recipe.agent.learning_rate == plain.agent.learning_rate  # it says nothing of that
     config = configure("experiment=cliff_q_learning", "agent=sarsa", "env=maze")
-    assert (config.agent.name, config.env.layout, config.recipe) == ("sarsa", "maze", "maze_sarsa")
+    assert (config.agent.name, config.env.layout, config.recipe) == ("sarsa", "maze", "sarsa/maze")
     assert configure("experiment=cliff_dqn", "observation=coordinates").observation.kind == "coordinates"
     assert configure("experiment=cliff_q_learning").observation.kind == "none"  # as the agent chooses
-    for study in STUDIES:  # these leave recipes and presets out
+    for study in STUDIES:  # these leave recipes out
         config = configure(f"experiment={study}")
         check(config)
         config.agent.check(config)
-        assert (config.recipe, config.preset in ("none", "auto")) == (None, True)
+        assert "/" not in str(config.recipe)
     assert configure("~experiment") == configure()
 
 
@@ -79,22 +89,22 @@ def test_each_job_of_a_sweep_has_the_recipe_of_its_pair(tmp_path: Path) -> None:
     summaries = [json.loads(file.read_text()) for file in (tmp_path / "sweep").glob("*/summary.json")]
     found = {(each["agent"], each["env"], each["recipe"]) for each in summaries}
     assert found == {
-        *(("q_learning", "cliff", "cliff_q_learning"), ("sarsa", "cliff", "cliff_sarsa")),
+        *(("q_learning", "cliff", "q_learning/cliff"), ("sarsa", "cliff", "sarsa/cliff")),
         *(("q_learning", "classic", None), ("sarsa", "classic", None)),
     }
 
 
-def test_the_manual_has_a_line_per_world() -> None:
+def test_the_manual_has_a_line_per_agent() -> None:
     _, shown = manual().split("tuned=...\n", 1)
     shown = shown.split("\n\n", 1)[0]
     assert max(map(len, shown.splitlines())) <= 100
-    found = set()
+    found, agent = set(), ""
     for word in shown.split("    Known to fail: ")[0].replace(",", "").split():
-        if word.endswith("_..."):
-            world = word.removesuffix("...")
-        else:
-            found.add(world + word)
-    assert found == set(RECIPES)
+        if word.endswith("/..."):
+            agent = word.removesuffix("/...")
+        elif agent:
+            found.add((word, agent))
+    assert found == {(file.stem, file.parent.name) for file in (CONF / "tuned").glob("*/*.yaml")}
 
 
 @pytest.mark.parametrize("name", ["dqn", "ppo", "a2c"])
@@ -109,14 +119,14 @@ def test_the_default_settings_are_the_librarys_own(name: str) -> None:
 
 
 def test_the_librarys_own_curves_have_tens_of_points() -> None:
-    for recipe, (env, agent) in PAIRS.items():
+    for env, agent in pairs().values():
         on_policy = re.fullmatch("(a2c|ppo|trpo)(_sb3_defaults)?", agent)
-        if on_policy and (recipe in RECIPES or env == "classic"):
+        if on_policy and ((env, agent) in RECIPES or env == "classic"):
             config = configure(f"env={env}", f"agent={agent}")
             algorithm, arguments = algorithm_and_arguments(config.agent)
             default = inspect.signature(algorithm.__init__).parameters["n_steps"].default
             iterations = config.total_timesteps // (arguments.get("n_steps", default) * config.n_envs)
-            assert 20 <= iterations // config.agent.log_interval <= 200, recipe
+            assert 20 <= iterations // config.agent.log_interval <= 200, (env, agent)
 
 
 @pytest.mark.parametrize("task", ["cliff", "four_rooms"])

@@ -43,7 +43,7 @@ DECLARED = {
         "logging.wandb",
         "checkpoint.every",
         "recipe",
-        "preset",
+        "env.recipes_of",
         "known_failure",
     },
 }

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import hydra
@@ -21,8 +21,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from gridworld.config.compose import register_schemas
-from gridworld.config.presets import with_preset
+from gridworld.config.recipes import Chosen, with_recipe_by_rule
 from gridworld.config.train import TrainConfig
+from gridworld.config.words import prepared
 from gridworld.sweeps.plan import Configurations
 from gridworld.training.train import train
 
@@ -71,14 +72,15 @@ def configure(*overrides: str) -> TrainConfig:
 
 @functools.lru_cache(maxsize=500)
 def _composed(overrides: tuple[str, ...]) -> TrainConfig:
+    return with_recipe_by_rule(prepared(overrides), lambda added: composed([*overrides, *added]))[0]
+
+
+def composed(words: Sequence[str]) -> tuple[TrainConfig, Chosen]:
+    """What a command line composes to by itself, and the files that it chooses, as for a sweep's plan."""
     configurations, master = _configurations()
     HydraConfig.instance().set_config(master)
     try:
-
-        def compose(chosen: list[str]) -> TrainConfig:
-            return configurations([*overrides, *chosen])
-
-        return with_preset(compose([]), overrides, compose)[0]
+        return configurations(words)
     finally:
         HydraConfig.instance().cfg = None
 

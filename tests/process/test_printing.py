@@ -140,7 +140,7 @@ def test_what_is_logged(caplog: pytest.LogCaptureFixture) -> None:
 
 WORDS = st.text("ab-.0", min_size=1, max_size=30)
 USUAL = {
-    "recipe": None, "preset": "none", "privileges": [], "agent": "dqn", "env": "classic", "seed": 0,
+    "recipe": None, "privileges": [], "agent": "dqn", "env": "classic", "seed": 0,
     "timesteps": 30208, "train_seconds": 0.8, "max_episode_steps": 100,
     "value": 0.93207, "goal_probability": 1.0, "length": 8.0, "regret": 0.0,
     "optimal_value": 0.93207, "optimal_goal_probability": 1.0, "optimal_length": 8.0,

@@ -26,9 +26,7 @@ SHORT = ["total_timesteps=200", "evaluation.every=20", *NO_FILES]
         (["env.num_rows=9"], "for large worlds:", "train agent=q_learning env.num_rows=9"),
     ],
 )
-def test_the_recipe_or_the_preset_comes_first(
-    words: list[str], reason: str, command: str, tmp_path: Path
-) -> None:
+def test_the_recipe_comes_first(words: list[str], reason: str, command: str, tmp_path: Path) -> None:
     found = "\n".join(f"{line}" for line in _lines(tmp_path / "a run", "agent=q_learning", *words, *SHORT))
     assert reason in found
     assert command in found

@@ -117,9 +117,8 @@ def test_settings_are_told_by_the_words_that_asked_for_them(tmp_path: Path) -> N
     words = ("agent=q_learning", "n_envs=${seed}", "seed=3,4", "total_timesteps=300")  # which follows from it
     followed = script("train.py", "-m", *words, *NO_PICTURES, cwd=tmp_path)
     assert [row[2] for row in results(followed.stdout)] == ["n_envs=3", "n_envs=4"]
-    presets = script("train.py", "-m", *QUICK, "env=four_rooms", "preset=auto,none,large", cwd=tmp_path)
-    assert [row[2] for row in results(presets.stdout)] == ["preset=auto", "preset=large"]
-    assert "preset=none repeats the runs of preset=auto; they run once" in presets.stderr
+    presets = script("train.py", "-m", *QUICK, "env=four_rooms", "tuned=none,large", cwd=tmp_path)
+    assert [row[2] for row in results(presets.stdout)] == ["tuned=none", "tuned=large"]
 
 
 def test_a_failure_stops_no_other_job(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from helpers.support import CONF, SHORT, configure, script
+from helpers.support import CONF, SHORT, composed, configure, script
 from hydra import compose, initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
@@ -42,7 +42,7 @@ def lines(loader: ConfigLoader, *words: str) -> list[str]:
 
 
 def hashes(*jobs: Sequence[str]) -> list[str]:
-    return [plan([(list(job), [])], lambda words: configure(*words))[0].hash for job in jobs]
+    return [plan([(list(job), [])], composed)[0].hash for job in jobs]
 
 
 def test_every_combination_is_a_job(loader: ConfigLoader) -> None:
@@ -92,14 +92,14 @@ def test_a_manifest_has_the_settings_of_its_job(agent: str, tmp_path: Path) -> N
 
 def test_a_sweep_runs_the_same_job_once_and_knows_mistakes() -> None:
     def of(*lines: str) -> list[Job]:
-        return plan([(line.split(), line.split()) for line in lines], lambda words: configure(*words))
+        return plan([(line.split(), line.split()) for line in lines], composed)
 
     jobs = of("seed=0", "seed=1", "seed=0", "seed=-1")
     assert [job.overrides for job in jobs] == [("seed=0",), ("seed=1",), ("seed=-1",)]
     assert [job.mistake for job in jobs] == [None, None, "seed=-1: must be from 0 to 4294967295"]
     assert [job.notes for job in jobs] == [(), (), ()]
-    (job,) = of("preset=auto seed=0", "preset=none seed=0")
-    assert job.notes[-1] == "preset=none repeats the runs of preset=auto; they run once"
+    (job,) = of("tuned=none seed=0", "preset=auto seed=0")
+    assert job.notes[-1] == "preset=auto repeats the runs of tuned=none; they run once"
 
 
 def job(*overrides: str, swept: Sequence[str] = (), digest: str = "0123456789abcdef") -> Job:
@@ -190,7 +190,7 @@ def test_each_job_is_what_hydra_composes(
     monkeypatch.setattr(type(loader), "load_sweep_config", counted)
     configure = Configurations(loader, master_of(loader))
     jobs = [overrides for overrides, _ in expand(words, loader, 100)]
-    configs = [configure(job) for job in jobs]
+    configs = [configure(job)[0] for job in jobs]
     assert len(by_hydra) == composed
     assert configs == [to_config(compose("train", job)) for job in jobs]
 

@@ -55,7 +55,9 @@ def failed(config: SB3Config, what: str, error: Exception) -> InputError:
     if isinstance(config, SB3ClassConfig):
         given |= {name: value for name, value in config.arguments.items() if name != "policy_kwargs"}
     suspects = ", ".join(f"{config.where}.{name}={value}" for name, value in given.items())
-    return unfit(config, f"{what}: {in_short(error)}" + (f"; check {suspects}" if suspects else ""))
+    hint = f"; check {suspects}" if suspects else ""
+    hint = "; add observation=image" if "NatureCNN only with images" in str(error) else hint
+    return unfit(config, f"{what}: {in_short(error)}{hint}")
 
 
 def algorithm_and_arguments(

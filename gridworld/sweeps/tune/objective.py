@@ -35,6 +35,7 @@ from gridworld.base.errors import InputError, reason
 from gridworld.base.processes import LostError
 from gridworld.base.signals import handling
 from gridworld.config.compose import to_config
+from gridworld.config.messages import sentence
 from gridworld.config.train import TrainConfig
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.setup import check_settings, make_context
@@ -86,7 +87,7 @@ def with_values(config: TrainConfig, values: Values) -> TrainConfig:
             with open_dict(node):
                 OmegaConf.update(node, key, value)
         except OmegaConfBaseException as error:
-            raise InputError(f"{key}={value}: {str(error).splitlines()[0]}") from None
+            raise InputError(f"{key}={value}: {sentence(error)}") from None
     return to_config(node)
 
 

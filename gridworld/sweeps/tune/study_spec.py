@@ -46,11 +46,13 @@ from gridworld.base.errors import InputError
 from gridworld.base.processes import core_count
 from gridworld.config.compose import compose_run, compose_whole, register_schemas, search_path, slug
 from gridworld.config.fields import Effect
+from gridworld.config.messages import sentence
 from gridworld.config.recipe_file import CHOSEN, with_recipe
+from gridworld.config.recipes import Chosen
 from gridworld.config.settings import effect_of
 from gridworld.config.sweep import DimensionConfig, TuneConfig
-from gridworld.config.train import AUTO, TrainConfig, check_bounds
-from gridworld.config.words import sentence
+from gridworld.config.train import TrainConfig, check_bounds
+from gridworld.run.folder import check_inside
 from gridworld.sweeps.tune.objective import Objective, Values, with_values
 from gridworld.training.setup import check_settings
 from gridworld.world.mdp import Mdp
@@ -115,10 +117,7 @@ def compose_study(words: Sequence[str], conf: tuple[Path, ...] = ()) -> StudySpe
         of_search, of_run = _divide(with_recipe(words))
         base, own, _ = compose_run([*of_run, *search_path(conf)], but=("ray", "slurm"))  # it runs here
         choices = {group: str(own.runtime.choices[group]) for group in CHOSEN}
-        if choices["preset"] == AUTO:  # nothing was chosen, and nothing is to be for the winner
-            choices["preset"] = "none"
-        if base.recipe is None:  # the pair has none
-            choices["tuned"] = "none"
+        choices["tuned"] = Chosen.of(own).recipe or "none"
         if not any(re.match(r"[+~]*tune(?!\.)", word) for word in of_search):
             of_search.append(f"tune={choices['agent']}")
         search = compose_whole("tune", [*of_search, *search_path(conf)])
@@ -172,6 +171,7 @@ def _completed(settings: TuneConfig, agent: str, base: TrainConfig) -> TuneConfi
     together = settings.together or (1 if workers == 1 else math.ceil(_TRIALS_AT_ONCE / workers))
     together = together if base.agent.shape is not None else 1
     folder = settings.folder or f"runs/{study}"
+    check_inside(Path(folder), "tune.folder")
     return dataclasses.replace(settings, study=study, folder=folder, workers=workers, together=together)
 
 

@@ -1,0 +1,212 @@
+"""Which recipe goes into a run's settings: one rule, by the names that were chosen and the world they make.
+
+A recipe is a yaml file of settings that were tuned for an agent: `conf/tuned/AGENT/WORLD.yaml` for a world,
+`conf/tuned/AGENT/stochastic.yaml` and `large.yaml` for a class of worlds. Unless `tuned=...` is given, it is
+
+1. the agent's own for the world, if that is as its yaml file says, whatever the step limit; or that of a
+   world which the file names in `recipes_of`;
+2. the agent's for the world's class: `stochastic` where an action may have several outcomes, or else `large`
+   where there are more states than in the default world; but not where the command line or an experiment
+   gives `total_timesteps` or `n_envs`, which its numbers rest on, nor where Stable-Baselines3's own loop
+   trains, for which they are too large;
+3. none: the agent's own settings.
+
+Hydra brings in the recipe of the two names by itself. Where the rule says another, the words are composed
+once more with `tuned=` it, as if it had been typed. Names of files count, never the labels in them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from gridworld.base.errors import InputError
+from gridworld.config.fields import Effect
+from gridworld.config.settings import effect_of, has_own_code
+from gridworld.config.train import TrainConfig
+from gridworld.config.words import CLASSES, conf_folder
+from gridworld.config.worlds import EnvConfig, World, compiled
+
+if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
+    from gridworld.world.mdp import Mdp
+
+GROUP, NONE = "tuned", "none"
+STOCHASTIC, LARGE = CLASSES
+_DEFAULT_WORLD, _DEFAULT_STATES = "classic", 30
+_ENGINE = "tabulated"  # the only one for which the numbers of a class are made
+_SIZE = ("total_timesteps", "n_envs")
+_GIVEN = re.compile(rf"[+~]*{GROUP}\b")
+_SIZED = re.compile(rf"[+~]*({'|'.join(_SIZE)})\b")
+_OF_A_WORLD = re.compile(rf"[+~]*(env|experiment|hydra|{GROUP})\b")
+_OTHER_WORLD = re.compile(r"[+~]*(env\.(?!max_episode_steps\b)|env=\{|experiment\b)")
+_WITH = " with "  # AGENT with ANOTHER/WORLD
+_MEASURED = frozenset({Effect.LEARNING, Effect.LENGTH, Effect.TASK})  # on what a measurement depends
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The files that a command line chooses, by their names."""
+
+    agent: str
+    env: str
+    tuned: str
+    folders: tuple[Path, ...]  # of yaml files
+
+    @classmethod
+    def of(cls, hydra: Any) -> Chosen:
+        """Read Hydra's own part of a composition."""
+        agent, env, tuned = (str(hydra.runtime.choices.get(group)) for group in ("agent", "env", GROUP))
+        places = (Path(each.path) for each in hydra.runtime.config_sources if each.schema == "file")
+        return cls(agent, env, tuned, tuple(places))
+
+    @property
+    def recipe(self) -> str | None:
+        """The recipe, if its file exists: a missing one is left out by Hydra."""
+        return self.tuned if self.tuned != NONE and self.has(self.tuned) else None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether no experiment chooses the recipe."""
+        return self.tuned == f"{self.agent}/{self.env}"
+
+    def has(self, recipe: str) -> bool:
+        """Whether there is such a file."""
+        return any((folder / GROUP / f"{recipe}.yaml").is_file() for folder in self.folders)
+
+    def check(self) -> None:
+        """Refuse a missing recipe, and one of the user's own that is not in its agent's folder."""
+        for tuned in (folder / GROUP for folder in self.folders):
+            if self.is_open and (old := tuned / f"{self.env}_{self.agent}.yaml").is_file():
+                place = f"{tuned / self.tuned}.yaml"
+                raise InputError(f"{old}: a recipe is in its agent's folder; move it to {place}")
+        if self.is_open or self.tuned in (NONE, "None") or self.has(self.tuned):
+            return
+        groups = [folder / GROUP for folder in self.folders]
+        files = [(file, group) for group in groups for file in group.rglob("*.yaml")]
+        known = sorted(file.relative_to(group).with_suffix("").as_posix() for file, group in files)
+        near = difflib.get_close_matches(self.tuned, known)
+        hint = f"; close matches: {', '.join(near)}" if near else ""
+        raise InputError(f"{GROUP}={self.tuned}: no such recipe{hint}; --help lists them all")
+
+    def settle(self, config: TrainConfig, words: Iterable[str]) -> TrainConfig:
+        """Set what the names say and no file can: the recipe, and whether it is known to fail as used."""
+        config.recipe, measured = self.agent, _DEFAULT_WORLD
+        if (name := self.recipe) is not None:
+            config.recipe = name if name.startswith(f"{self.agent}/") else f"{self.agent}{_WITH}{name}"
+            measured = name.rpartition("/")[2]
+        keys = {word.lstrip("+~").partition("=")[0] for word in words} - {"agent", "env", GROUP}
+        is_changed = any(effect_of(key) in _MEASURED for key in keys if not key.startswith("hydra"))
+        if is_changed or measured not in (self.env, *config.env.recipes_of):
+            config.known_failure = None
+        return config
+
+
+def agent_and_recipe(text: str) -> tuple[str, str | None]:
+    """The names of the agent and of its recipe, None for none, in a run's setting `recipe`."""
+    agent, other, name = text.partition(_WITH)
+    return (agent, name) if other else (text.partition("/")[0], text if "/" in text else None)
+
+
+def may_need_recipe(words: Sequence[str]) -> bool:
+    """Whether a command line may choose another world than the default one, or a recipe."""
+    return any(map(_OF_A_WORLD.match, words))
+
+
+def with_recipe_by_rule(
+    words: Sequence[str],
+    compose: Callable[[list[str]], tuple[TrainConfig, Chosen]],
+    world: World = compiled,
+) -> tuple[TrainConfig, list[str]]:
+    """Compose a command line, and once more where the rule says another recipe than Hydra brought in.
+
+    `compose` takes words besides `words`. Returns the settings, and the words that were added.
+    """
+    config, chosen = compose([])
+    chosen.check()
+    if chosen.is_open and not any(map(_GIVEN.match, words)):
+        for name in _in_order(config, chosen, words, world):
+            if name == chosen.recipe:
+                break
+            word = f"{GROUP}={name or NONE}"
+            again, others = compose([word])
+            sizes = {} if name is None else _sizes(others, name)
+            if all(getattr(again, key) == number for key, number in sizes.items()):
+                return others.settle(again, words), [word]
+    return chosen.settle(config, words), []
+
+
+def _in_order(
+    config: TrainConfig, chosen: Chosen, words: Sequence[str], world: World
+) -> Iterator[str | None]:
+    """The recipes that fit, the best one first; the next one is for where an experiment has its own sizes."""
+    names = [f"{chosen.agent}/{name}" for name in (chosen.env, *config.env.recipes_of)]
+    own = next(filter(chosen.has, names), None)
+    if own is not None and (not any(map(_OTHER_WORLD.match, words)) or is_world(config.env, chosen.env)):
+        yield own
+    elif not any(map(_SIZED.match, words)):
+        yield recipe_of_class(chosen.agent, config, lambda: world(config.env), chosen.has)
+    yield None
+
+
+def recipe_of_class(
+    agent: str,
+    config: TrainConfig,
+    world: Callable[[], Mdp],
+    has: Callable[[str], bool] = lambda name: (conf_folder() / GROUP / f"{name}.yaml").is_file(),
+) -> str | None:
+    """The agent's recipe for the world's class; None where it has none, or the settings make no world."""
+    known = [name for name in CLASSES if has(f"{agent}/{name}")]
+    if not known or getattr(config.agent, "engine", _ENGINE) != _ENGINE or has_own_code(config.callbacks):
+        return None
+    try:
+        mdp = world()
+    except (InputError, TypeError, ValueError, OSError):  # the check before training says why
+        return None
+    name = STOCHASTIC if mdp.is_stochastic else LARGE if mdp.num_states > _DEFAULT_STATES else None
+    return f"{agent}/{name}" if name in known else None
+
+
+def is_world(env: EnvConfig, name: str) -> bool:
+    """Whether a world is the one that `env=name` chooses of the shipped ones, whatever the step limit."""
+    file = conf_folder() / "env" / f"{name}.yaml"
+    if not file.is_file():
+        return False
+    own = dataclasses.asdict(type(env)()) | yaml.safe_load(file.read_text("utf-8"))
+    given = dataclasses.asdict(env)
+    return all(own[key] == given[key] for key in given.keys() - {"max_episode_steps", "recipes_of"})
+
+
+def recipe_note(config: TrainConfig, mdp: Mdp) -> str | None:
+    """What a user should know of a run's recipe before training: which it is, why, how to leave it out."""
+    agent, recipe = agent_and_recipe(config.recipe or "")
+    size = f"{mdp.name} has {mdp.num_states:,} states"
+    why = f"{mdp.name} is stochastic" if mdp.is_stochastic else size
+    if recipe is None:
+        fitting = recipe_of_class(agent, config, lambda: mdp)
+        left_out = f"the recipe {fitting} is meant for that, but is left out because of the given settings"
+        return None if fitting is None else f"{why}: {left_out}"
+    own, _, name = recipe.rpartition("/")
+    other = [] if own == agent else ["agent"]
+    is_shipped = (conf_folder() / "env" / f"{name}.yaml").is_file()
+    if is_shipped and name not in config.env.recipes_of and not is_world(config.env, name):
+        other.append("world")
+    reason = f", since {why}" if name in CLASSES else ""
+    reason = f", tuned for another {' and '.join(other)}" if other else reason
+    steps = f"{config.total_timesteps:,} steps"
+    return f"recipe {recipe}{reason}: {steps}; {GROUP}={NONE} keeps the agent's own settings"
+
+
+def _sizes(chosen: Chosen, recipe: str) -> dict[str, Any]:
+    """What the numbers of a class's recipe rest on, as its file has it."""
+    if recipe.rpartition("/")[2] not in CLASSES:
+        return {}
+    files = (folder / GROUP / f"{recipe}.yaml" for folder in chosen.folders)
+    content = yaml.safe_load(next(filter(Path.is_file, files)).read_text("utf-8"))
+    return {key: content[key] for key in _SIZE if key in content}
