@@ -14,7 +14,7 @@ import sys
 from fractions import Fraction
 
 KEYS = ["claim", "digest", "ended", "gamma", "lower", "policy", "scope", "start", "steps", "upper", "world"]
-MOST_BYTES, ROUNDING = 2**31, Fraction(1, 10**12)
+MOST_BYTES, ROUNDING = 2**28, Fraction(1, 10**12)
 
 
 def need(holds, what):
@@ -39,7 +39,7 @@ def mean(row, bound, gamma=1):
 
 
 def check(given):
-    """The regret from the start is at most the first, and the policy is worth at least the second."""
+    """From the start no policy is worth more than the first, and this one at least the second."""
     need(sorted(given) == KEYS and 0 <= given["gamma"] <= 1, f"not the keys {KEYS}, or not a discount")
     gamma, policy, upper, lower = (given[name] for name in ("gamma", "policy", "upper", "lower"))
     rows = {s: [checked(row, f"state {s}") for row in actions] for s, actions in given["world"].items()}
@@ -64,8 +64,13 @@ def check(given):
         for s, most in given["steps"].items():
             left = mean([(p, then) for p, then, _ in rows[s][policy[s]]], given["steps"])
             need(most >= 1 + left, f"state {s}: the policy may take longer")
-    worth = mean(start, lower)
-    return mean(start, upper) - worth, worth
+    need(isinstance(given["scope"], str) and len(given["scope"]) < 2000, "scope: not a sentence")
+    return mean(start, upper), mean(start, lower)
+
+
+def outwards(number, towards):  # the nearest float that is not on the other side
+    near = float(number)
+    return near if near == number or (near > number) == (towards > 0) else math.nextafter(near, towards)
 
 
 def parsed(text):
@@ -79,16 +84,16 @@ def digest_of(given):
 
 
 if __name__ == "__main__":
-    for path in sys.argv[1:]:
+    for path in sys.argv[1:] or sys.exit(__doc__):
         try:
             with (gzip.open if path.endswith(".gz") else open)(path, "rb") as file:
                 need(len(text := file.read(MOST_BYTES + 1)) <= MOST_BYTES, f"more than {MOST_BYTES:,} bytes")
-            (regret, worth), given = check(parsed(text)), json.loads(text)
+            (best, worth), given = check(parsed(text)), json.loads(text)
             need(given["digest"] == digest_of(given), "digest: not that of its rows")
+            least = outwards(worth, -math.inf)
+            most = outwards(best - Fraction(least), math.inf)
         except Exception as error:  # whatever is wrong with a file, it proves nothing
             sys.exit(f"{path}: DOES NOT HOLD: {error or type(error).__name__}")
-        most, least = (float(each) for each in (regret, worth))  # rounded, and now outwards
-        most = most if most >= regret else math.nextafter(most, math.inf)
-        least = least if least <= worth else math.nextafter(least, -math.inf)
         print(f"{path}: holds. The policy earns at least {least}, and no policy earns {most} more than that.")
-        print(f"  Rows {digest_of(given)}, {len(given['world']):,} states, known like this: {given['scope']}")
+        size, scope = f"{len(given['world']):,} states", ascii(given["scope"])
+        print(f"  Rows {digest_of(given)}, {size}, known like this: {scope}")

@@ -101,7 +101,7 @@ def comparisons(workload: Workload) -> Iterator[Comparison]:
 
 def learner(words: Sequence[str], steps: int, mdp: Mdp | None = None) -> Callable[[], float]:
     """Measures the training of an agent, by the words of its command line; `mdp` in place of its world."""
-    return partial(steps_per_second, [(*words, f"total_timesteps={steps}", "preset=none", "tuned=none")], mdp)
+    return partial(steps_per_second, [(*words, f"total_timesteps={steps}", "tuned=none")], mdp)
 
 
 def steps_per_second(commands: Sequence[Sequence[str]], mdp: Mdp | None = None) -> float:

@@ -110,6 +110,7 @@ def _show(spec: StudySpec, kind: str, package: str | None) -> None:
     from omegaconf import OmegaConf
 
     shown: Any = OmegaConf.create(dataclasses.asdict(spec.base))
+    del shown["recipe"]  # which no word can set
     if kind != "job":
         settings = dataclasses.replace(spec.settings, space={})
         shown.tune = dataclasses.asdict(settings) | {"space": spec.space.plain()}

@@ -13,13 +13,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from gridworld.base.console import printable, telling_if_slow
-from gridworld.base.errors import InputError
+from gridworld.base.console import printable, tell_error, telling_if_slow
+from gridworld.base.errors import EXIT_CODE, InputError
 from gridworld.base.user_input import limited
 from gridworld.commands import parser_of
 from gridworld.report.evidence import find_runs
 from gridworld.training.saved_run import SavedRun
-from gridworld.training.verify import Verified, proven
+from gridworld.training.verify import Verified, check_out, proven
 
 _NOT_PROVEN = 1  # the exit code
 
@@ -32,14 +32,28 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(problems[0])
     if options.out is not None and len(folders) > 1:
         raise InputError(f"--out {options.out}: is for one run, and there are {len(folders)}")
-    proofs = [_verified(folder, options) for folder in folders]
+    if options.out is not None:
+        check_out(options.out)
+    proofs, mistakes = list[tuple[Verified, bool]](), 0
+    for folder in folders:
+        try:
+            proofs.append(_verified(folder, options))
+        except InputError as error:
+            if len(folders) == 1:
+                raise
+            mistakes += 1
+            tell_error(str(error))
     claimed = [verified for verified, is_certified in proofs if is_certified]
     optimal = sum(verified.is_optimal for verified in claimed)
     if len(proofs) > 1:
-        print(f"{optimal} of {len(claimed)} certified runs are proven optimal, of {len(proofs)} in all")
+        unread = f"; {mistakes} could not be read" if mistakes else ""
+        in_all = f"of {len(proofs)} in all{unread}"
+        print(f"{optimal} of {len(claimed)} certified runs are proven optimal, {in_all}")
     if options.out is not None:
         proofs[0][0].write(options.out)
         print(printable(f"  certificate: {options.out}"))
+    if mistakes:
+        sys.exit(EXIT_CODE)
     if optimal < len(claimed) or not all(verified.certificate for verified, _ in proofs):
         sys.exit(_NOT_PROVEN)
 
@@ -51,10 +65,11 @@ def _verified(folder: Path, options: argparse.Namespace) -> tuple[Verified, bool
         saved = SavedRun(folder, options.trust, options.best)
         evaluator = saved.evaluator()
         verified = proven(evaluator, saved.snapshot().greedy)
+    is_certified = bool(saved.run.read_summary().get("certified")) and not options.best
     mdp, gamma = evaluator.mdp, evaluator.solution.gamma
     print(printable(f"{folder} on {mdp.name}, discount {gamma:g}: {verified}"))
     print(printable(f"  world: {mdp.scope}"), flush=True)
-    return verified, bool(saved.run.read_summary().get("certified")) and not options.best
+    return verified, is_certified
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -130,14 +130,17 @@ def refuse_unused(own: DictConfig, but: Collection[str] = ()) -> None:
 def completed(words: Sequence[str], world: World = compiled) -> list[str]:
     """A command line as Hydra takes it, with the words that choose the recipe of a single run."""
     own = list(own_conf_folders(words))
-    found = prepared(words)
+    options = {word.partition("=")[0] for word in words} & _NO_SINGLE_RUN
+    found = prepared(words, of_many=bool(options & {"-m", "--multirun"}))
     places = [number for number, _ in enumerate(found) if is_override(found, number)]
     values = [found[number] for number in places]
-    if {word.partition("=")[0] for word in found} & _NO_SINGLE_RUN or not (own or may_need_recipe(values)):
+    if options or not (own or may_need_recipe(values)):
         return found
     added: list[str] = []
     try:
-        added = compose_run([*search_path(own), *values], None, world)[2]
+        _, whole, added = compose_run([*search_path(own), *values], None, world)
+        agent = whole.runtime.choices.agent
+        found = [word.replace("tuned=${agent}", f"tuned={agent}") for word in found]
     except InputError:
         raise
     except Exception:  # Hydra composes again, and says what is wrong

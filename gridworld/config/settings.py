@@ -43,6 +43,7 @@ NEWER = frozenset(
         *("agent.reward_scale", "env.rewards", "observation.features"),
     }
 )
+_GONE = frozenset({"preset"})  # settings of earlier versions, which say nothing that a run needs
 ON_RESULT = frozenset(Effect) - {Effect.FILES, Effect.NOTHING}
 _LARGEST_KWARG = 1000  # of an environment: sizes, and what it pays
 
@@ -278,7 +279,7 @@ def _read(schema: type, content: Any, where: str, stand_in: dict[type, type], se
         for name in hints
         if section + name in NEWER or effect_of(section + name) in (Effect.FILES, Effect.NOTHING)
     }
-    if odd := sorted((content.keys() ^ hints.keys()) - optional):
+    if odd := sorted((content.keys() ^ hints.keys()) - optional - _GONE):
         fault = "lacks" if odd[0] in hints else "has an unknown key"
         raise InputError(f"{where}: {fault} {odd[0][:80]}; was the run written by another version?")
     values = {}

@@ -43,11 +43,12 @@ def is_override(words: Sequence[str], index: int) -> bool:
     return not words[index].startswith("-") and (index == 0 or words[index - 1] not in _WITH_VALUE)
 
 
-def prepared(words: Sequence[str]) -> list[str]:
+def prepared(words: Sequence[str], of_many: bool = False) -> list[str]:
     """A command line as Hydra takes it: 1e5 as 100000, experiment=ENV_AGENT as the choice of the two.
 
     An environment by its id, or by the name of its class, is the choice env=gymnasium with that id. A recipe
     may be named as in earlier versions, tuned=ENV_AGENT or preset=CLASS; a class alone is that of the agent.
+    In the words `of_many` runs, a recipe stays as it is named, until these are known.
     """
     found: list[str] = []
     chosen = {word.lstrip("+").partition("=")[0] for word in words if "=" in word}
@@ -57,8 +58,11 @@ def prepared(words: Sequence[str]) -> list[str]:
             raise InputError(f"{word}: a setting cannot be taken away; give it a value, {key[1:]}=...")
         if key == "env" and all(map(is_id, value.split(","))):
             found += ["env=gymnasium", f"env.id={value}"]
+        elif of_many and key in ("tuned", "preset"):
+            found.append(word)
         elif key == "tuned":
-            found.append(f"tuned={','.join(map(_recipe, value.split(',')))}")
+            if not (value == "none" and {f"preset={name}" for name in CLASSES} & set(words)):
+                found.append(f"tuned={_recipe(value)}")
         elif key == "preset":
             found += _of_preset(word, value, [each for each in words if each.startswith("tuned=")])
         elif key.lstrip("+") == "experiment" and value in pairs():

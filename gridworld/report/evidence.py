@@ -62,6 +62,7 @@ class Evidence:
     pictures: Mapping[str, str]  # as `RunReader.pictures`
     step_limit: Any  # of an episode, as the summary has it
     privileges: Sequence[str]  # as `config.settings.privileges` finds them in its settings
+    recipe: str | None  # AGENT/NAME
     proven_regret: float | None  # at least the final greedy policy's; None: nothing is proven
     scope: str  # how the tables of its world are known; "" by construction
     damage: tuple[str, ...]  # a sentence for each of its other files that is not the one that it wrote
@@ -198,6 +199,7 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
         pictures=run.pictures(),
         step_limit=summary.get("max_episode_steps"),
         privileges=privileges(config),
+        recipe=recipe if isinstance(recipe := summary.get("recipe"), str) else None,
         proven_regret=proven if isinstance(proven := summary.get("proven_regret"), float) else None,
         scope=printable(scope_of(summary))[:_LONGEST_SCOPE],
         damage=damaged,

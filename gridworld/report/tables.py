@@ -258,10 +258,10 @@ def runs_table(study: Study) -> Table:
     for group, run in study.runs:
         first = int(run.first_certified_step) if math.isfinite(run.first_certified_step) else None
         certified = "yes" if run.certified else "no"
-        rows.append([group.task, group.agent, run.seed, certified, run.regret, run.proven_regret, first])
-        rows[-1] += [run.steps, run.seconds, str(run.folder)]
-    columns = ["task", "agent", "seed", "certified", "regret", "proven regret", "first certificate"]
-    columns += ["steps", "seconds"]
+        rows.append([group.task, group.agent, run.recipe or NOTHING, run.seed, certified])
+        rows[-1] += [run.regret, run.proven_regret, first, run.steps, run.seconds, str(run.folder)]
+    columns = ["task", "agent", "recipe", "seed", "certified", "regret", "proven regret"]
+    columns += ["first certificate", "steps", "seconds"]
     return Table("runs", "All runs that are counted", [*columns, "folder"], rows)
 
 

@@ -15,6 +15,7 @@ from gridworld.run.folder import EVENTS, RunFolder, shell_path
 from gridworld.run.reader import read_run
 from gridworld.world.mdp import BY_CONSTRUCTION
 from gridworld.world.metrics import METRICS
+from gridworld.world.proof import at_most
 
 Summary = dict[str, Any]
 
@@ -118,7 +119,11 @@ def verdict(summary: Summary) -> str:
     if summary["optimal_length"] >= summary["max_episode_steps"]:  # then the optimum does not end either
         count = 0
     loops = circles_text(count, names, summary["timeout_probability"])
-    return f"not optimal: regret {summary['regret']:.3g}{loops}"
+    regret, proven = max(summary["regret"], 0.0), summary.get("proven_regret")
+    if proven is not None or not regret:
+        most = "" if proven is None else f", and at most {at_most(proven)} by proof"
+        return f"not proven optimal: regret {regret:.3g} by floating point{most}"
+    return f"not optimal: regret {regret:.3g}{loops}"
 
 
 def scope_of(summary: Summary) -> str:

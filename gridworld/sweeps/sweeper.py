@@ -85,7 +85,7 @@ def _of_yaml(settings: SweepConfig) -> list[str]:
             raise InputError(
                 f"hydra.sweeper.params.{key}: must be text as on the command line, such as 0,1 or range(3)"
             )
-    return prepared([f"{key}={value}" for key, value in settings.params.items()])
+    return prepared([f"{key}={value}" for key, value in settings.params.items()], of_many=True)
 
 
 class _Sweep:

@@ -10,6 +10,7 @@ import gzip
 import importlib.util
 import json
 import math
+import os
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -20,7 +21,8 @@ import numpy as np
 
 import gridworld
 from gridworld.base.atomic_write import write_bytes
-from gridworld.base.errors import InputError
+from gridworld.base.console import printable
+from gridworld.base.errors import InputError, reason
 from gridworld.base.user_input import as_path, limited
 from gridworld.training.saved_run import SavedRun
 from gridworld.world.chain import Chain, one_hot_policy
@@ -31,6 +33,7 @@ from gridworld.world.proof import at_most
 _MOST_EXACT = 1_000_000  # outcomes of all rows: about half a minute in fractions
 _ROUNDED = 12  # digits of values that may be meant as round numbers, without a discount
 _MORE = 1e-6  # of the expected steps to the end, which need only be a bound
+_BEGINS = b'{"claim": '
 _CLAIM = (
     "Under the discount gamma, the policy is worth at least the lower bounds where it goes, and no policy is "
     "worth more than the upper bounds."
@@ -69,8 +72,28 @@ class Verified:
         """Write the certificate as JSON, compressed if the name ends with .gz."""
         if not self.certificate:
             raise InputError(f"{path}: not written, since {self}")
+        check_out(path)
         content = json.dumps(self.certificate).encode()
-        write_bytes(path, gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
+        write_bytes(path, gzip.compress(content, mtime=0) if path.name.endswith(".gz") else content)
+
+
+def check_out(path: Path) -> None:
+    """Refuse a place where no certificate can be written, or where something else is than an older one."""
+    try:
+        if not path.absolute().parent.is_dir():
+            raise InputError(f"{path}: there is no folder {path.parent}")
+        if path.is_symlink() or path.exists():
+            other = f"{path}: is there, and is no certificate; choose a new file"
+            if path.is_symlink() or not path.is_file():
+                raise InputError(other)
+            with (gzip.open if path.name.endswith(".gz") else open)(path, "rb") as file:
+                if file.read(len(_BEGINS)) != _BEGINS:
+                    raise InputError(other)
+        os.fsencode(path)
+    except (OSError, EOFError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{printable(str(path)[:80])}: cannot be written: {reason(error)}") from None
 
 
 @limited()
@@ -86,15 +109,18 @@ def verify(run: Any, out: str | PathLike[str] | None = None, *, best: bool = Fal
         `regret`, `is_optimal`, `is_exact`, and the `certificate`; its text is a sentence.
 
     Raises:
-        InputError: no finished run; nothing is proven, and a file is asked for.
+        InputError: no finished run; nothing is proven, and a file is asked for; there is something else.
     """
+    place = None if out is None else as_path("verify: out", out)
+    if place is not None:
+        check_out(place)
     saved = getattr(run, "saved", None)
     if saved is None or best:
         saved = SavedRun(as_path("verify: run", getattr(run, "folder", run)), best=best)
     snapshot: PolicySnapshot = saved.snapshot()
     verified = proven(saved.evaluator(), snapshot.greedy)
-    if out is not None:
-        verified.write(as_path("verify: out", out))
+    if place is not None:
+        verified.write(place)
     return verified
 
 
@@ -117,7 +143,8 @@ def proven(evaluator: Evaluator, greedy: IntArray) -> Verified:
         found["digest"] = checker.digest_of(found)
         try:
             if bounds is None or is_exact:
-                exact = checker.check(checker.parsed(json.dumps(found)))[0]
+                best_worth, worth = checker.check(checker.parsed(json.dumps(found)))
+                exact = best_worth - worth
             else:
                 exact = bounds.regret(lower)
         except ValueError:

@@ -25,8 +25,7 @@ _QUICKLY_SOLVED = 20_000  # outcomes of all states and actions: a few tenths of 
 # Relative to the optimum's discounted absolute rewards from the start; a detour of one step costs at least
 # 1 % at the default discount. Where the optimum earns and pays nothing, it is the rounding of a reward.
 REGRET_TOLERANCE = 1e-6
-# Discounts nearer to 1 than the first may leave a proof to rounding, than the second they do.
-HARDLY_PROVEN, NEAREST_PROVEN = 1 - 1e-8, 1 - 1e-9
+_ROUNDING = 1e-9  # of the largest value: a smaller regret may be that of a linear system's rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +51,8 @@ class Score:
     certified: bool  # no policy is better
     outcome: Outcome  # of an episode within the step limit
     scope: str = BY_CONSTRUCTION  # how the world's tables are known
-    # Of a certified policy: its regret is at most this, by bounds that hold whatever rounding did. None: it
-    # is certified by floating point alone, as at a discount of 1.
+    # Where it is small: it is at most this, by bounds that hold whatever rounding did. None: a certified
+    # policy is so by floating point alone, as at a discount of 1.
     proven_regret: float | None = None
 
     @property
@@ -66,7 +65,8 @@ class Score:
         numbers = {"value": self.value, "regret": self.shortfall, **vars(self.outcome)}
         shown = (f"{name}={number + 0.0:.4g}" for name, number in numbers.items())  # -0 as 0
         scope = "" if self.scope == BY_CONSTRUCTION else f", scope={self.scope!r}"
-        return f"Score(certified={self.certified}, {', '.join(shown)}{scope})"
+        floating = ", by floating point" if self.certified and self.proven_regret is None else ""
+        return f"Score(certified={self.certified}{floating}, {', '.join(shown)}{scope})"
 
 
 class Evaluator:
@@ -103,9 +103,9 @@ class Evaluator:
 
     @cached_property
     def bounds(self) -> Bounds | None:
-        """Proven bounds of what policies are worth; None: the discount is too near to 1."""
+        """Proven bounds of what policies are worth; None at a discount of 1."""
         found, gamma = self.solution, self.solution.gamma
-        return None if gamma > NEAREST_PROVEN else Bounds(self.mdp, gamma, found.v, self.tolerance / 2)
+        return None if gamma == 1 else Bounds(self.mdp, gamma, found.v, self.tolerance / 2)
 
     def optimal_policy(self) -> FloatArray:
         """The policy (S, A) that takes the first of the optimal actions."""
@@ -125,8 +125,9 @@ class Evaluator:
         if certified and self.bounds is not None:
             proven = self.bounds.regret(self.bounds.lower(chain, values))
             certified = proven <= self.tolerance
-            if not certified and self.solution.gamma > HARDLY_PROVEN:
-                proven, certified = None, True
+        elif certified and not self._earns_nothing:  # nothing bounds what is lost where large rewards cancel
+            lost = np.finfo(np.float64).eps * self._at_start(chain.evaluation(1.0).scale)
+            certified = max(lost, -regret) <= self.tolerance
         outcome = chain.outcome(self.max_episode_steps)
         return Score(value, regret, certified, outcome, self.mdp.scope, proven)
 
@@ -134,7 +135,12 @@ class Evaluator:
         """V_π (S,) of the policy of a chain."""
         gamma = self.solution.gamma
         # An optimum that earns nothing has no scale beside which a linear system's rounding is small.
-        return chain.evaluation(gamma).value if self._earns_nothing else chain.value(gamma)
+        if self._earns_nothing:
+            return chain.evaluation(gamma).value
+        values = chain.value(gamma)
+        regret = abs(self.optimal_value - self._at_start(values))
+        is_rounding = self.tolerance < regret < _ROUNDING * np.abs(values).max(initial=0.0)
+        return chain.evaluation(gamma).value if is_rounding else values
 
     def discounted_return(self, policy: FloatArray) -> float:
         """The exact expected discounted return of an episode within the step limit, of a policy (S, A)."""

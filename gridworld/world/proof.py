@@ -134,11 +134,12 @@ class Bounds:
         total = (weight * (paid + moved - faded)).sum(axis=2)
         size = (weight * (np.abs(paid) + np.abs(moved) + np.abs(faded))).sum(axis=2)
         count = weight.shape[2]
-        lost = 8 * (count + 1) * _LEAST * (size > 0)
+        is_more = (weight > 0) & ((paid != 0) | (here != 0) | (x[following] != 0))  # else nothing is lost
+        lost = 8 * (count + 1) * _LEAST * is_more.any(axis=2)
         rest: FloatArray = total + size * (1.01 * (2 * count + 8) * _UNIT) + lost
         return rest
 
 
 def at_most(number: float) -> str:
     """A bound with two digits, rounded up."""
-    return f"{float(Context(2, ROUND_CEILING).create_decimal(number)):.2g}"
+    return f"{Context(2, ROUND_CEILING).create_decimal(number):.2g}"

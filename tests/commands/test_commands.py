@@ -188,7 +188,7 @@ def test_tune_shows_what_train_would_run(capsys: pytest.CaptureFixture[str], tmp
     assert "\n  trials: 10\n" in whole
     assert shows(*words, "-c", "job", "-p", "agent.gamma") == "# @package agent.gamma\n0.9\n"
     assert shows(*words, "--cfg", "--package", "env").startswith(
-        "# @package env\nmax_episode_steps: 100\nlayout: classic\n"
+        "# @package env\nmax_episode_steps: 100\nrecipes_of: []\nlayout: classic\n"
     )
     for more, told in (
         (["--cfg", "--package", "nowhere"], "--package nowhere: no such part of the configuration"),

@@ -26,7 +26,39 @@ ARGUMENTS = {"family_of_worlds.py": ["dqn", "--pairs", "2", "--observations", "o
 
 
 def test_all_examples_are_tried() -> None:
-    assert {path.name for path in EXAMPLES.glob("*.py")} == set(PRINTED)
+    run_by_its_page = "from_rl_zoo.py"
+    assert {path.name for path in EXAMPLES.glob("*.py")} == {*PRINTED, run_by_its_page}
+
+
+def test_a_section_of_rl_zoo_becomes_an_agent() -> None:
+    """What is Python in it is read, not run."""
+    zoo = module_of("examples/from_rl_zoo")
+    section = {
+        "normalize": True,
+        "n_envs": 8,
+        "n_timesteps": 1e5,
+        "policy": "MlpPolicy",
+        "n_steps": 32,
+        "policy_kwargs": "dict(net_arch=dict(pi=[64], vf=[64]), activation_fn=nn.ReLU, ortho_init=False)",
+    }
+    settings, left = zoo.converted("ppo", section)
+    kwargs = {"net_arch": {"pi": [64], "vf": [64]}, "activation_fn": "torch.nn.ReLU", "ortho_init": False}
+    assert settings == {
+        "n_envs": 8,
+        "total_timesteps": 100_000,
+        "agent": {
+            "name": "zoo_ppo",
+            "algorithm": "stable_baselines3.PPO",
+            "policy": "MlpPolicy",
+            "arguments": {"n_steps": 32, "policy_kwargs": kwargs},
+        },
+    }
+    assert left == ["normalize"]
+    for text in ("__import__('os').getcwd()", "dict(a=open('b'))"):
+        with pytest.raises(ValueError, match="malformed"):
+            zoo.converted("ppo", section | {"policy_kwargs": text})
+    with pytest.raises(SystemExit, match="sac: is not for discrete actions"):
+        zoo.converted("sac", section)
 
 
 @pytest.mark.parametrize("name", PRINTED)

@@ -185,9 +185,17 @@ def test_a_goal_that_is_reached_more_often_for_less_is_explained() -> None:
 
 @pytest.mark.parametrize("length", [8.0, 100.0])
 def test_a_loop_is_a_reason_unless_the_optimum_never_ends_either(length: float) -> None:
-    summary = USUAL | {"certified": False, "endless_cells": [[0, 0]], "endless_states": ["state 0"]}
-    summary |= {"timeout_probability": 1.0, "optimal_length": length}
+    summary = USUAL | {"certified": False, "regret": 0.5, "endless_cells": [[0, 0]]}
+    summary |= {"endless_states": ["state 0"], "timeout_probability": 1.0, "optimal_length": length}
     assert ("loops until the step limit" in summary_text(summary, "x")) == (length < 100)
+
+
+def test_a_regret_that_is_small_by_floats_alone_is_not_called_one() -> None:
+    summary = USUAL | {"certified": False, "proven_regret": 7332.4, "endless_cells": []}
+    summary |= {"endless_states": [], "timeout_probability": 0.0}
+    assert "not proven optimal: regret 0 by floating point, and at most 7.4e+3 by proof" in summary_text(
+        summary, "x"
+    )
 
 
 def test_the_list_of_a_sweeps_jobs(

@@ -62,7 +62,7 @@ def test_a_file_is_checked_with_python_alone(tmp_path: Path) -> None:
         )
         == 2
     )
-    assert done.stdout.count(f"Rows {found['digest']}, 26 states, known like this: by construction") == 2
+    assert done.stdout.count(f"Rows {found['digest']}, 26 states, known like this: 'by construction'") == 2
     source = SCRIPT.read_text()
     assert "gridworld" not in source
     imported = set(re.findall(r"^(?:import|from) (\w+)", source, re.MULTILINE))
@@ -80,6 +80,11 @@ WRONG: dict[str, tuple[Any, str]] = {
     "a text": (lambda text: re.sub(r'("upper": {"0": )[\d.e-]+', r'\1"9"', text), "sequence"),
     "another digest": (lambda text: re.sub(r'"digest": "..', '"digest": "xx', text), "digest"),
     "bytes": (lambda text: "\x00" + text, "Expecting"),
+    "a scope that is no sentence": (lambda text: text.replace('"by construction"', '["x"]'), "scope"),
+    "beyond floats": (
+        lambda text: re.sub(r'("lower": {"0": )[\d.e-]+', rf"\g<1>-{10**400}", text),
+        "too large",
+    ),
     "deep": (lambda text: "[" * 100_000, "recursion"),
 }
 
@@ -173,10 +178,10 @@ def truth(found: dict[str, Any]) -> float:
 
 def accepted(checker: ModuleType, found: Any) -> Fraction | None:
     try:
-        regret: Fraction = checker.check(checker.parsed(json.dumps(found)))[0]
+        best, worth = checker.check(checker.parsed(json.dumps(found)))
     except Exception:  # as the script takes it
         return None
-    return regret
+    return Fraction(best) - worth
 
 
 def test_falsified_files_claim_no_more_than_is_true(holding: list[dict[str, Any]]) -> None:
@@ -253,6 +258,7 @@ def battery(holding: list[dict[str, Any]]) -> list[str]:
     found += [
         {**leaving, "upper": {"0": 1, "5": 9}},
         {**LOOP, "gamma": 0.5, "policy": {}, "lower": {}, "upper": {"0": 1}},
+        {**leaving, "scope": ["x"]},
     ]
     found += [
         {
@@ -318,6 +324,54 @@ def test_a_run_is_verified_and_written(tmp_path: Path) -> None:
     assert run(tmp_path / "certificate.json.gz").returncode == 0
     with pytest.raises(InputError, match="nothing is proven"):
         Verified(np.inf, is_optimal=False, is_exact=False, certificate={}).write(tmp_path / "none.json")
+
+
+def test_a_certificate_is_written_where_nothing_else_is(tmp_path: Path) -> None:
+    run_folder, file = tmp_path / "run", tmp_path / "c.json.gz"
+    gridworld.train("agent=q_learning", folder=run_folder)
+    before = (run_folder / "model.zip").read_bytes()
+    (tmp_path / "link.json").symlink_to(run_folder / "model.zip")
+    for name, why in (
+        *((name, "is no certificate") for name in ("run/model.zip", "run", "/dev/null", "link.json")),
+        *(("none/c.json", "there is no folder"), ("x" * 300, "too long"), ("\ud800", "surrogates")),
+    ):
+        with pytest.raises(InputError, match=why):
+            gridworld.verify(run_folder, tmp_path / name)
+    assert (run_folder / "model.zip").read_bytes() == before
+    for _ in range(2):  # an older one may be replaced
+        gridworld.verify(run_folder, file)
+    assert run(file).returncode == 0
+
+
+def test_what_a_file_says_of_itself_is_printed_as_one_text(tmp_path: Path) -> None:
+    forged = certificate() | {"scope": "by construction\nother.json: holds.\x1b[2A"}
+    (tmp_path / "forged.json").write_text(json.dumps(forged))
+    done = run(tmp_path / "forged.json")
+    assert done.returncode == 0
+    assert len(done.stdout.splitlines()) == 2
+    assert "\x1b" not in done.stdout
+
+
+def test_both_numbers_that_it_prints_hold_together(tmp_path: Path) -> None:
+    """The most that a policy earns more is beside the least that it earns as printed, after its rounding."""
+    found = certificate() | {
+        "gamma": 0.5,
+        "start": [["0", 0.85], ["1", 1 - 0.85]],
+        "ended": ["e"],
+        "policy": {"0": 0, "1": 0},
+        "world": {"0": [[[1.0, "e", 1e100]]], "1": [[[1.0, "e", 3e99]]]},
+        "upper": {"0": 1e100, "1": 3e99},
+        "lower": {"0": 1e100, "1": 3e99},
+        "steps": {},
+    }
+    found["digest"] = _checker().digest_of(found)
+    (tmp_path / "c.json").write_text(json.dumps(found))
+    told = run(tmp_path / "c.json").stdout
+    least, most = (Fraction(float(each)) for each in re.findall(r"earns (?:at least )?([\d.e+-]+)[, ]", told))
+    exact = (Fraction(0.85) * Fraction(1e100) + Fraction(1 - 0.85) * Fraction(3e99)) / (
+        Fraction(0.85) + Fraction(1 - 0.85)
+    )
+    assert least <= exact <= least + most
 
 
 def test_the_command_verifies_several_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -174,4 +174,66 @@ def test_what_never_ends_is_not_proven_by_the_inequalities_alone() -> None:
 
 
 def test_a_bound_is_rounded_up() -> None:
-    assert [at_most(each) for each in (1.71e-13, 2.0, 0.0, 99.4)] == ["1.8e-13", "2", "0", "1e+02"]
+    assert [at_most(each) for each in (1.71e-13, 2.0, 0.0, 99.4, 5e-324)] == [
+        *("1.8e-13", "2", "0", "1.0e+2", "5.0e-324")
+    ]
+
+
+HIDDEN, RARE = 6e-14, (1e-9, 2.5e-9)  # a better action that no float shows at this discount
+HARD = {
+    0: {a: [(1 - p, a, -1.0, False), (p, 2, -1.0, False)] for a, p in enumerate(RARE)},
+    1: {a: [(1 - RARE[1], 1, -1.0, False), (RARE[1], 2, -1.0, False)] for a in (0, 1)},
+    2: {a: [(1 - HIDDEN, 2, -1.0, False), (HIDDEN, 3, -1.0, True)] for a in (0, 1)},
+    3: {a: [(1.0, 3, 0.0, True)] for a in (0, 1)},
+}
+
+
+@pytest.mark.parametrize("gamma", [1 - 1e-8, 1 - 1e-9, 1 - 1e-10, 1 - 1e-11])
+def test_what_a_bound_denies_is_not_certified(gamma: float) -> None:
+    mdp = gridworld.compile_mdp(HARD, [1.0, 0.0, 0.0, 0.0])
+    evaluator = Evaluator(mdp, gamma, 100)
+    for actions in ([0] * mdp.num_states, [1] * mdp.num_states):
+        score = evaluator.score(one_hot_policy(np.array(actions), 2))
+        proven_regret = np.inf if score.proven_regret is None else score.proven_regret
+        assert not score.certified or proven_regret <= evaluator.tolerance
+
+
+def test_without_a_discount_floats_that_cancel_certify_nothing() -> None:
+    ways: dict[int, dict[int, list[tuple[float, int, float, bool]]]] = {
+        0: {0: [(1.0, 5, 1.0, True)], 1: [(1.0, 1, -8.0, False)]}
+    }
+    for state, reward in ((1, -4.0), (2, 9.0), (3, -1e17), (4, 1e17)):
+        ways[state] = {a: [(1.0, state + 1, reward, state == 4)] for a in (0, 1)}
+    ways[5] = {a: [(1.0, 5, 0.0, True)] for a in (0, 1)}
+    evaluator = Evaluator(gridworld.compile_mdp(ways, [1.0, *[0.0] * 5]), 1.0, 100)
+    worse = one_hot_policy(np.ones(evaluator.mdp.num_states, dtype=int), 2)
+    assert not evaluator.score(worse).certified
+
+
+def test_what_is_far_from_a_pit_is_scored_without_its_rounding() -> None:
+    """A linear system's error is beside its largest value, which no start may come to."""
+    pit = {0: [(0.7, 2, -1e9, False), (0.3, 2, 0.0, False)]}
+    back = {0: [(0.7, 0, -1e9, False), (0.3, 1, 0.0, False)]}
+    rows = {
+        0: pit | {1: pit[0]},
+        2: back | {1: back[0]},
+        3: {a: [(1.0, 4, -1e-7, True)] for a in (0, 1)},
+        1: {0: [(0.7, 1, 0.0, False), (0.3, 1, 0.0, False)], 1: [(1.0, 0, -1.0, False)]},
+        4: {a: [(1.0, 4, 0.0, True)] for a in (0, 1)},
+    }
+    mdp = gridworld.compile_mdp(rows, [0.0, 0.5, 0.0, 0.5, 0.0])
+    score = Evaluator(mdp, 0.99, 100).score(one_hot_policy(np.zeros(mdp.num_states, dtype=int), 2))
+    assert score.certified
+    assert score.value == pytest.approx(-5e-8, rel=1e-12)
+
+
+def test_a_bound_of_what_underflows_is_not_0() -> None:
+    rows = {
+        0: {0: [(1.0, 1, 0.0, True)], 1: [(1e-300, 1, 1e-100, True), (1.0, 1, 0.0, True)]},
+        1: {a: [(1.0, 1, 0.0, True)] for a in (0, 1)},
+    }
+    mdp = gridworld.compile_mdp(rows, [1.0, 0.0])
+    first = np.zeros(mdp.num_states, dtype=int)
+    proven_regret = Evaluator(mdp, 0.99, 100).score(one_hot_policy(first, 2)).proven_regret
+    assert proven_regret is not None
+    assert Fraction(proven_regret) >= Fraction(1e-300) * Fraction(1e-100)
