@@ -50,10 +50,11 @@ class Bounds:
         self._live, self._starts = ~mdp.terminal, mdp.start_states
         self._share = mdp.start[self._starts] / mdp.start[self._starts].sum()
         self._states: IntArray = np.flatnonzero(mdp.reachable & self._live)
-        size, following = len(self._states), mdp.next_state[self._states]
-        paid, chance = mdp.reward[self._states], mdp.probability[self._states]
+        following, paid, chance = (
+            table[self._states] for table in (mdp.next_state, mdp.reward, mdp.probability)
+        )
         self._weight = chance / chance.sum(axis=2, keepdims=True)
-        self._flat = following.reshape(size, 1, -1), -paid.reshape(size, 1, -1)
+        self._following, self._lost = following, -paid
         self.upper = self._above(
             values,
             lambda actions: Chain(mdp, one_hot_policy(actions, mdp.num_actions)),
@@ -67,8 +68,14 @@ class Bounds:
             chain: of the policy.
             values: V_π (S,), but for rounding.
         """
-        weight = chain.policy[self._states][:, :, None] * self._weight
-        return -self._above(-values, lambda actions: chain, *self._flat, weight.reshape(len(weight), 1, -1))
+        policy, size = chain.policy[self._states], len(self._states)
+        taken = np.arange(size), policy.argmax(axis=1)
+        if (policy[taken] == 1).all():
+            rows = [each[taken][:, None] for each in (self._following, self._lost, self._weight)]
+        else:
+            weight = policy[:, :, None] * self._weight
+            rows = [each.reshape(size, 1, -1) for each in (self._following, self._lost, weight)]
+        return -self._above(-values, lambda actions: chain, *rows)
 
     def regret(self, lower: FloatArray) -> float:
         """The regret from the start distribution that a policy with this lower bound (S,) has at most."""

@@ -163,10 +163,14 @@ class Beliefs:
             self._num_parts += len(belief)
             is_long = max(each.denominator.bit_length() for _, each in belief) > _MOST_BITS
             is_many = len(self.nodes) > self._most or self._num_parts > _MOST_PARTS or is_long
-            if is_many or time.monotonic() > self._until:
+            if time.monotonic() > self._until:
                 raise self._refusal(
-                    "its observations do not show its state, and what histories say of it has no end in "
-                    "the time or "
+                    f"its time is over: its observations show {len(self.nodes):,} situations so far, "
+                    "and there are more"
+                )
+            if is_many:
+                raise self._refusal(
+                    "its observations do not show its state, and what histories say of it has no end in the "
                     f"size allowed: after {len(self.nodes):,} different distributions of {self._num_parts:,} "
                     "probabilities there are more; show more of the state, or set a limit "
                     "(env.kwargs.max_episode_steps)"

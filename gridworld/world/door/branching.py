@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 import math
 import sys
+import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -61,6 +62,7 @@ class Branching:
         self._taken: list[int] = []  # the place of each decision's outcome among those possible
         self._place = 0  # of the next decision
         self._refused: InputError | None = None  # kept, since an environment may catch it
+        self.until = math.inf  # the moment, of the monotonic clock, at which its time is over
         self.run = 0  # counts the runs, so that what is left of another one is recognised
         self._is_running = False
         self._num_results = 0
@@ -69,7 +71,12 @@ class Branching:
         """Run a step once for each sequence of draws: its different results, each with its probability."""
         self._decisions, self._taken = [], []
         shares: dict[Result, dict[int, int]] = {}  # numerators by denominators, which is fast
-        for _ in range(MOST_BRANCHES):
+        for number in range(MOST_BRANCHES):
+            if time.monotonic() > self.until:
+                raise InputError(
+                    f"{self._where}: a reset or a step has more random outcomes than can be tried in the "
+                    f"time allowed: after {number:,} there are more"
+                )
             result = self._ran(step)
             numerator, denominator = self._share()
             of_result = shares.setdefault(result, {})
@@ -85,7 +92,7 @@ class Branching:
                 self._decisions.pop()
             if not self._taken:
                 return {
-                    result: sum((Fraction(number, of) for of, number in each.items()), Fraction(0))
+                    result: sum((Fraction(part, of) for of, part in each.items()), Fraction(0))
                     for result, each in shares.items()
                 }
             self._taken[-1] += 1

@@ -13,6 +13,7 @@ import hashlib
 import itertools
 import math
 import pickle
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -137,6 +138,7 @@ class Search:
     def _explored(self, counts_time: bool, keeps_shared: bool) -> None:
         runs = (Search.reset_from.__code__, Search.stepped_from.__code__)
         self.branching = Rejecting(self.where, self._everything, runs, self._read is not None, self._compares)
+        self.branching.until = time.monotonic() + self.budget.seconds_left()
         self.layers = layers = Layers(self.where, self.env, self.branching, counts_time, keeps_shared)
         self._is_complete = counts_time  # nothing that an environment may read is left out
         with layers.restored():

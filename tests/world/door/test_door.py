@@ -900,3 +900,27 @@ class FarKey(Coins):
 def test_what_is_far_away_is_met_too(make: Callable[[], Any]) -> None:
     with pytest.raises(InputError, match=r"another generator|depends on more"):
         gridworld.compile_env(make())
+
+
+class Retries(gym.Env):
+    """A goal is drawn again until it fits, at most fifty times."""
+
+    observation_space, action_space = gym.spaces.MultiDiscrete([6, 6]), gym.spaces.Discrete(2)
+
+    def _cell(self):
+        return tuple(self.np_random.integers(0, 6, size=2).tolist())
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        tries, self.goal = 0, self._cell()
+        while sum(self.goal) < 3 and tries < 50:
+            self.goal, tries = self._cell(), tries + 1
+        return self.goal, {}
+
+    def step(self, action):
+        return self.goal, 0.0, True, False, {}
+
+
+def test_a_reset_with_too_many_outcomes_is_refused_within_its_time():
+    with pytest.raises(InputError, match="more random outcomes than can be tried in the time allowed: after"):
+        gridworld.compile_env(Retries, most_seconds=0.5)
