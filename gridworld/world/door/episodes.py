@@ -56,7 +56,7 @@ def check_by_episodes(search: Search) -> None:
     with search.branching.drawing(np.random.default_rng(2)):
         while left > 0:
             search.layers.put(search.begin)
-            seen = search.see(search.layers.env.reset()[0])
+            seen = search.see(search.layers.env.reset(**search.layers.reset_options)[0])
             possible = {each.following for each in search.resets.starts if each.seen == seen}
             if not possible:
                 raise search.refusal(f"a reset shows what was not enumerated, {_MORE}")

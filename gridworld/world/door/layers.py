@@ -101,6 +101,7 @@ class Layers:
         self._chain = chain  # without the neutral ones
         self.may_see_cuts = self.limited is not None and not all(map(known.steps_once, self.layers[:-1]))
         self.env: Any = self.layers[0]
+        self.reset_options = {} if self.env is env else {"options": None}  # as a layer around it has it
         self.base: Any = self.layers[-1]
         holders = holders_of(dict.fromkeys(kind for layer in self.layers for kind in type(layer).__mro__))
         found = shared_with(holders) if keeps_shared else []

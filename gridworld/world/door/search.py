@@ -263,7 +263,7 @@ class Search:
     def reset_from(self, copy: bytes) -> Result:
         self.layers.put(copy)
         try:
-            returned = self.layers.env.reset()
+            returned = self.layers.env.reset(**self.layers.reset_options)
         except Exception as error:  # whatever it raises
             raise self._failed("a reset", error) from error
         if not (isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[1], dict)):

@@ -30,7 +30,7 @@ def walk(search: Search, kind: type, look: Callable[[], None] = lambda: None) ->
 
 
 def _steps(search: Search, kind: type, numbers: np.random.Generator) -> Iterator[Any]:
-    yield search.see(search.layers.env.reset()[0])
+    yield search.see(search.layers.env.reset(**search.layers.reset_options)[0])
     for _ in range(_WALK):
         if search.layers.unread:  # whose stand-ins come with a copy
             search.layers.put(search.layers.take())

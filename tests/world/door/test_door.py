@@ -924,3 +924,24 @@ class Retries(gym.Env):
 def test_a_reset_with_too_many_outcomes_is_refused_within_its_time():
     with pytest.raises(InputError, match="more random outcomes than can be tried in the time allowed: after"):
         gridworld.compile_env(Retries, most_seconds=0.5)
+
+
+class Optional(gym.Env):
+    """Its own default for `options` is not the one that Gymnasium's wrappers hand down."""
+
+    observation_space, action_space = gym.spaces.Discrete(4), gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options={}):  # noqa: B006
+        super().reset(seed=seed)
+        self.place = 0 if options is None else options["start"]
+        return self.place, {}
+
+    def step(self, action):
+        self.place = min(max(self.place + (1 if action else -1), 0), 3)
+        return self.place, float(self.place == 3), self.place == 3, False, {}
+
+
+def test_a_reset_is_called_as_the_wrapper_around_it_does():
+    assert gridworld.compile_env(lambda: wrappers.TimeLimit(Optional(), 20)).num_states == 4
+    with pytest.raises(InputError, match="a reset fails: KeyError: 'start'"):
+        gridworld.compile_env(Optional)
