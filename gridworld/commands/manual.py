@@ -34,7 +34,7 @@ it had never been interrupted. Options of resume=RUN:
   anyway=true             resume with other versions or on another processor; the last bits may differ
 
 An agent uses the recipe that was tuned for it in the world, or for stochastic or large worlds where it has
-none or the world is changed; the command line overrides it. tuned=none leaves recipes out.
+none or slips are added; the command line overrides it. tuned=none leaves recipes out.
 
 recipe=FILE uses what tune.py found: a study's folder, or the yaml file in it. It is read as data, so results
 of strangers are safe; the command line overrides them. --config-dir FOLDER adds your own yaml files; Hydra

@@ -3,8 +3,8 @@
 A recipe is a yaml file of settings that were tuned for an agent: `conf/tuned/AGENT/WORLD.yaml` for a world,
 `conf/tuned/AGENT/stochastic.yaml` and `large.yaml` for a class of worlds. Unless `tuned=...` is given, it is
 
-1. the agent's own for the world, if that is as its yaml file says, whatever the step limit; or that of a
-   world which the file names in `recipes_of`;
+1. the agent's own for the world, or that of a world which the file in `conf/env` names in `recipes_of`; but
+   not where other settings than the file's make its actions stochastic;
 2. the agent's for the world's class: `stochastic` where an action may have several outcomes, or else `large`
    where there are more states than in the default world; but not where the command line or an experiment
    gives `total_timesteps` or `n_envs`, which its numbers rest on, nor where Stable-Baselines3's own loop
@@ -148,7 +148,10 @@ def _in_order(
     """The recipes that fit, the best one first; the next one is for where an experiment has its own sizes."""
     names = [f"{chosen.agent}/{name}" for name in (chosen.env, *config.env.recipes_of)]
     own = next(filter(chosen.has, names), None)
-    if own is not None and (not any(map(_OTHER_WORLD.match, words)) or is_world(config.env, chosen.env)):
+    is_changed = any(map(_OTHER_WORLD.match, words)) and not is_world(config.env, chosen.env)
+    if own is not None and not (
+        is_changed and (mdp := _compiled(lambda: world(config.env))) is not None and mdp.is_stochastic
+    ):
         yield own
     elif not any(map(_SIZED.match, words)):
         yield recipe_of_class(chosen.agent, config, lambda: world(config.env), chosen.has)
@@ -165,12 +168,19 @@ def recipe_of_class(
     known = [name for name in CLASSES if has(f"{agent}/{name}")]
     if not known or getattr(config.agent, "engine", _ENGINE) != _ENGINE or has_own_code(config.callbacks):
         return None
-    try:
-        mdp = world()
-    except (InputError, TypeError, ValueError, OSError):  # the check before training says why
+    mdp = _compiled(world)
+    if mdp is None:
         return None
     name = STOCHASTIC if mdp.is_stochastic else LARGE if mdp.num_states > _DEFAULT_STATES else None
     return f"{agent}/{name}" if name in known else None
+
+
+def _compiled(world: Callable[[], Mdp]) -> Mdp | None:
+    """The world; None where the settings make none: the check before training says why."""
+    try:
+        return world()
+    except (InputError, TypeError, ValueError, OSError):
+        return None
 
 
 def is_world(env: EnvConfig, name: str) -> bool:

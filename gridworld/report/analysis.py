@@ -121,7 +121,7 @@ def _last(column: str) -> Callable[[Evidence, Reference], float]:
 # fmt: off
 _METRICS = (
     RunMetric("regret", "final regret", lambda run, _: run.regret, ("iqm", "median", "mean"), -1, True),
-    RunMetric("steps", "steps to the first certificate", lambda run, _: run.first_certified_step,
+    RunMetric("steps", "steps until certified for good", lambda run, _: run.certified_since_step,
               ("iqm", "median"), -1, True),
     RunMetric("optimality", "optimality", _optimality, ("iqm", "mean")),
     *(RunMetric(metric.name, metric.label, _last(metric.name)) for metric in REPORTED),
@@ -195,8 +195,8 @@ class Result:
 
     @property
     def shortest_uncertified(self) -> float:
-        """Steps that every run without a certificate was at least given."""
-        ends = [run.steps for run in self.group.runs if math.isinf(run.first_certified_step)]
+        """Steps that every run which is not certified in the end was at least given."""
+        ends = [run.steps for run in self.group.runs if not run.certified]
         return float(min(ends, default=0))
 
 
@@ -329,7 +329,7 @@ def _task(task: str, groups: list[Group], seed: int, log_steps: bool) -> TaskAna
     runs = [run for group in groups for run in group.runs]
     world = _reference(next((run for run in runs if not run.damage), runs[0]))
     ends = [max(run.steps for run in group.runs) for group in groups]
-    learned = [float(np.median([run.first_certified_step for run in group.runs])) for group in groups]
+    learned = [float(np.median([run.certified_since_step for run in group.runs])) for group in groups]
     for steps in (ends, learned):  # whether one agent ran, or learned, ten times as long as another
         known = [step for step in steps if 0 < step < math.inf]
         log_steps |= bool(known) and max(known) >= _SLOWER * min(known)

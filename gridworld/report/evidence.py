@@ -83,6 +83,13 @@ class Evidence:
         return 0.0 if self.certified else round(float(self.curve["regret"][-1]), _DIGITS)
 
     @property
+    def certified_since_step(self) -> float:
+        """Environment steps since which every evaluation is certified; infinite where the last one is not."""
+        lost = np.flatnonzero(self.curve["certified"] != 1)
+        since = int(lost[-1]) + 1 if len(lost) else 0
+        return float(self.curve["step"][since]) if since < len(self.curve["step"]) else math.inf
+
+    @property
     def first_certified_step(self) -> float:
         """Environment steps at the first certificate; infinite where there was none."""
         hits = np.flatnonzero(self.curve["certified"])

@@ -75,8 +75,8 @@ def _order(value: str) -> tuple[bool, float, str]:
 _SHOWN = {  # title of a metric, and the statistic that the figures of a sweep show
     "certified": ("seeds certified", "share of seeds certified at the end"),
     "steps": (
-        "steps to certificate",
-        "steps to the first certificate, median over seeds; none where fewer than half have one",
+        "steps until certified",
+        "steps until certified for good, median over seeds; none where fewer than half are",
     ),
     "regret": ("final regret", "interquartile mean (IQM) over seeds"),
 }

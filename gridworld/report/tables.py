@@ -28,8 +28,8 @@ _SCORES = tuple(key for key in METRICS if key not in ("regret", "steps"))
 _HEADINGS = {
     ("regret", "iqm"): "regret, IQM",
     ("regret", "median"): "regret, median",
-    ("steps", "iqm"): "steps to certificate, IQM",
-    ("steps", "median"): "steps to certificate, median",
+    ("steps", "iqm"): "steps until certified for good, IQM",
+    ("steps", "median"): "steps until certified for good, median",
 }
 
 
@@ -195,7 +195,7 @@ def _table_of(
 
 
 def task_table(task: TaskAnalysis) -> Table:
-    """Certified seeds, regret and steps to the certificate on a task."""
+    """Certified seeds, regret and steps until certified for good on a task."""
     rows: list[list[Cell]] = [
         [result.group.agent, result.certified, result.ever, *(estimate(result, *each) for each in _HEADINGS)]
         for result in task.results
@@ -256,11 +256,14 @@ def runs_table(study: Study) -> Table:
     """A row for each run that is counted."""
     rows: list[list[Cell]] = []
     for group, run in study.runs:
-        first = int(run.first_certified_step) if math.isfinite(run.first_certified_step) else None
+        since, first = (
+            int(step) if math.isfinite(step) else None
+            for step in (run.certified_since_step, run.first_certified_step)
+        )
         certified = "yes" if run.certified else "no"
-        rows.append([group.task, group.agent, run.recipe or NOTHING, run.seed, certified])
-        rows[-1] += [run.regret, run.proven_regret, first, run.steps, run.seconds, str(run.folder)]
-    columns = ["task", "agent", "recipe", "seed", "certified", "regret", "proven regret"]
+        rows.append([group.task, group.agent, run.recipe or NOTHING, run.seed, certified, run.regret])
+        rows[-1] += [run.proven_regret, since, first, run.steps, run.seconds, str(run.folder)]
+    columns = ["task", "agent", "recipe", "seed", "certified", "regret", "proven regret", "certified since"]
     columns += ["first certificate", "steps", "seconds"]
     return Table("runs", "All runs that are counted", [*columns, "folder"], rows)
 

@@ -157,11 +157,11 @@ def _certified(results: Sequence[_Result]) -> str:
 
 
 def _steps(results: Sequence[_Result]) -> str:
-    """The median step of the first certificate, or more than what the runs without one were given."""
-    first = [result.summary["first_certified_step"] for result in results]
-    median = statistics.median(math.inf if step is None else step for step in first)
+    """The median step of being certified for good, or more than what the runs that are not were given."""
+    since = [result.summary["certified_since_step"] for result in results]
+    median = statistics.median(math.inf if step is None else step for step in since)
     if math.isfinite(median):
         return f"{round(median):,}"
     summaries = [result.summary for result in results]
-    given = [summary["timesteps"] for summary in summaries if summary["first_certified_step"] is None]
+    given = [summary["timesteps"] for summary in summaries if summary["certified_since_step"] is None]
     return f"> {min(given):,}"

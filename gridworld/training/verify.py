@@ -83,7 +83,7 @@ def check_out(path: Path) -> None:
         if not path.absolute().parent.is_dir():
             raise InputError(f"{path}: there is no folder {path.parent}")
         if path.is_symlink() or path.exists():
-            other = f"{path}: is there, and is no certificate; choose a new file"
+            other = f"{path}: is there and not a certificate; choose a new file"
             if path.is_symlink() or not path.is_file():
                 raise InputError(other)
             with (gzip.open if path.name.endswith(".gz") else open)(path, "rb") as file:

@@ -115,6 +115,7 @@ def test_real_runs_are_reported(tmp_path: Path) -> None:
         assert float(row["regret"]) == pytest.approx(summary["regret"])
         assert row["proven regret"] == str(summary["proven_regret"] or "")
         assert row["first certificate"] == str(summary["first_certified_step"] or "")
+        assert row["certified since"] == str(summary["certified_since_step"] or "")
     page = (folder / "report.html").read_text()
     assert page.count('src="data:image/png;base64,') == 3  # the maps of the median seed
     why = rows_of(folder / "tables" / "not_certified.csv")
@@ -476,7 +477,7 @@ def test_no_figure_has_only_zeros_and_labels_are_whole(maker: Maker, tmp_path: P
     (task,) = gather([tmp_path]).tasks
     agents = {result.group.agent for result in task.results}
     drawn = figures_of(task)  # nobody is ever certified
-    assert set(drawn) == {"classic regret", "classic final regret", "classic steps to the first certificate"}
+    assert set(drawn) == {"classic regret", "classic final regret", "classic steps until certified for good"}
     assert "ppo (gamma=0.9, learning_rate=0.3, total_timesteps=1000)" in agents
 
     def rows(chart: Chart) -> set[str]:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from helpers.disk import Disk, Left, put_back
 from helpers.resuming import begin, begin_or_go_on, differences, go_on, left_behind, stopped_after
-from helpers.support import SHORT, configure
+from helpers.support import SHORT, composed, configure
 
 from gridworld.base.errors import InputError
 from gridworld.run.reader import read_run
@@ -89,7 +89,7 @@ def test_a_run_goes_on_after_a_power_cut(every: str, is_resumed: bool, tmp_path:
 def run_sweep(folder: Path) -> None:
     """As a sweep does it, without Hydra around it."""
     asked = [([*SAVED, f"seed={seed}"], [f"seed={seed}"]) for seed in range(2)]
-    jobs = plan(asked, lambda words: configure(*words))
+    jobs = plan(asked, composed)
     sweep = SweepFolder(folder)
     sweep.check(jobs, extend=False)
     with sweep.at_work():
