@@ -308,7 +308,7 @@ def test_beliefs_without_end_are_refused(compiled: Any, monkeypatch: pytest.Monk
     monkeypatch.setattr(beliefs, "_MOST_BITS", 256)
     faint = type("Faint", (Hidden,), {"clear": 0.75})  # evidence adds up for as long as one looks
     with pytest.raises(
-        InputError, match=r"has no end in the time or size allowed: after [\d,]+ different distributions"
+        InputError, match=r"has no end in the size allowed: after [\d,]+ different distributions"
     ):
         compiled(faint)
 
