@@ -56,7 +56,7 @@ def evaluate(
         max_episode_steps: step limit of an episode; None: the environment's own, or 100.
 
     Returns:
-        Its `value`, `regret`, `certified`, `proven_regret` if it is certified, and the `outcome` of an
+        Its `value`, `regret`, `certified`, `proven_regret` where that is small, and the `outcome` of an
         episode, which has the probabilities of `goal`, `trap` and `timeout`, `expected_return` and
         `expected_length`.
 

@@ -13,7 +13,7 @@ from gridworld.commands import parser_of, whole
 from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.rendering import has_display
 from gridworld.envs.rollout import SampledScores, play, sample_episodes
-from gridworld.run.summary import MOST_NAMED, circles_text
+from gridworld.run.summary import MOST_NAMED, circles_text, shortfall_text
 from gridworld.training.saved_run import SavedRun, choose_policy
 from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.mdp import BY_CONSTRUCTION, FloatArray
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str]) -> None:
             states = evaluator.endless_states(policy)
             names = [evaluator.mdp.state_name(state) for state in states[:MOST_NAMED]]
             circles = circles_text(len(states), names, score.outcome.timeout)
-            verdict = f"not optimal: regret {score.regret:.3g}{circles}"
+            verdict = shortfall_text(score.regret, proven, circles)
     of = f"{options.run} (best model, step {saved.steps():,})" if options.best else options.run
     print(printable(f"{options.policy} policy of {of} on {evaluator.mdp.name}"))
     print(table)

@@ -143,8 +143,8 @@ def completed(words: Sequence[str], world: World = compiled) -> list[str]:
         found = [word.replace("tuned=${agent}", f"tuned={agent}") for word in found]
     except InputError:
         raise
-    except Exception:  # Hydra composes again, and says what is wrong
-        added = []
+    except Exception:
+        pass  # Hydra composes again, and says what is wrong
     end = places[-1] + 1 if places else len(found)  # options may follow
     return [*found[:end], *added, *found[end:]]
 

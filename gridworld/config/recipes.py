@@ -108,8 +108,9 @@ class Chosen:
         return config
 
 
-def agent_and_recipe(text: str) -> tuple[str, str | None]:
-    """The names of the agent and of its recipe, None for none, in a run's setting `recipe`."""
+def agent_and_recipe(config: TrainConfig) -> tuple[str, str | None]:
+    """The names of the agent, "" if it is not known, and of its recipe, None for none."""
+    text = config.recipe or ""
     agent, other, name = text.partition(_WITH)
     return (agent, name) if other else (text.partition("/")[0], text if "/" in text else None)
 
@@ -195,7 +196,7 @@ def is_world(env: EnvConfig, name: str) -> bool:
 
 def recipe_note(config: TrainConfig, mdp: Mdp) -> str | None:
     """What a user should know of a run's recipe before training: which it is, why, how to leave it out."""
-    agent, recipe = agent_and_recipe(config.recipe or "")
+    agent, recipe = agent_and_recipe(config)
     size = f"{mdp.name} has {mdp.num_states:,} states"
     why = f"{mdp.name} is stochastic" if mdp.is_stochastic else size
     if recipe is None:

@@ -119,7 +119,12 @@ def verdict(summary: Summary) -> str:
     if summary["optimal_length"] >= summary["max_episode_steps"]:  # then the optimum does not end either
         count = 0
     loops = circles_text(count, names, summary["timeout_probability"])
-    regret, proven = max(summary["regret"], 0.0), summary.get("proven_regret")
+    return shortfall_text(summary["regret"], summary.get("proven_regret"), loops)
+
+
+def shortfall_text(regret: float, proven: float | None, loops: str) -> str:
+    """What a policy that is not certified lacks: `proven` bounds a regret that is small by floats."""
+    regret = max(regret, 0.0)
     if proven is not None or not regret:
         most = "" if proven is None else f", and at most {at_most(proven)} by proof"
         return f"not proven optimal: regret {regret:.3g} by floating point{most}"

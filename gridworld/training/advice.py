@@ -49,7 +49,7 @@ def _commands(saved: SavedRun, place: str) -> Iterator[list[str]]:
     """(why, command) of what may help."""
     run, config = saved.run, saved.config
     words = [word for word in saved.overrides if _key(word) not in _REPLACED]
-    agent, recipe = agent_and_recipe(config.recipe or "")
+    agent, recipe = agent_and_recipe(config)
     is_open = recipe is None and not saved.omission  # then words of its command line are missing
     if is_open and (env := _world_with_recipe(agent, config)) is not None:
         own = [word for word in words if _key(word).partition(".")[0] not in ("env", "experiment", "agent")]

@@ -294,7 +294,7 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
         "scope": mdp.scope + ("" if acts_by is None else f"; actions are what {acts_by}.predict answers"),
         "observation": config.observation.kind,
         "seed": config.seed,
-        "recipe": agent_and_recipe(config.recipe or "")[1],
+        "recipe": agent_and_recipe(config)[1],
         "privileges": privileges(dataclasses.asdict(config)),
         "total_timesteps": config.total_timesteps,
         "timesteps": last.step,

@@ -24,6 +24,7 @@ from gridworld.base.atomic_write import write_bytes
 from gridworld.base.console import printable
 from gridworld.base.errors import InputError, reason
 from gridworld.base.user_input import as_path, limited
+from gridworld.run.folder import check_writable
 from gridworld.training.saved_run import SavedRun
 from gridworld.world.chain import Chain, one_hot_policy
 from gridworld.world.evaluation import Evaluator, PolicySnapshot
@@ -72,16 +73,17 @@ class Verified:
         """Write the certificate as JSON, compressed if the name ends with .gz."""
         if not self.certificate:
             raise InputError(f"{path}: not written, since {self}")
-        check_out(path)
+        check_file(path)
         content = json.dumps(self.certificate).encode()
         write_bytes(path, gzip.compress(content, mtime=0) if path.name.endswith(".gz") else content)
 
 
-def check_out(path: Path) -> None:
+def check_file(path: Path) -> None:
     """Refuse a place where no certificate can be written, or where something else is than an older one."""
     try:
         if not path.absolute().parent.is_dir():
             raise InputError(f"{path}: there is no folder {path.parent}")
+        check_writable(path.absolute().parent, "file")
         if path.is_symlink() or path.exists():
             other = f"{path}: is there and not a certificate; choose a new file"
             if path.is_symlink() or not path.is_file():
@@ -113,7 +115,7 @@ def verify(run: Any, out: str | PathLike[str] | None = None, *, best: bool = Fal
     """
     place = None if out is None else as_path("verify: out", out)
     if place is not None:
-        check_out(place)
+        check_file(place)
     saved = getattr(run, "saved", None)
     if saved is None or best:
         saved = SavedRun(as_path("verify: run", getattr(run, "folder", run)), best=best)
