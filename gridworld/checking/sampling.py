@@ -22,8 +22,8 @@ from gymnasium import spaces
 
 from gridworld.base.errors import in_short
 from gridworld.world.door.attributes import GENERATORS, random_states, state_of
-from gridworld.world.door.layers import contents
 from gridworld.world.door.observations import content
+from gridworld.world.door.traits import contents
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 Env = gym.Env[Any, Any]

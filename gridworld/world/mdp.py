@@ -160,6 +160,12 @@ class Mdp:
             digest.update(np.ascontiguousarray(getattr(self, name)).tobytes())
         return digest.hexdigest()
 
+    def shown_digest(self) -> str:
+        """The sha256 of the tables and of what the environment shows in each state."""
+        shown = [] if self.own_observation is None else leaves_of(self.own_observation)
+        parts = (np.ascontiguousarray(each).tobytes() for each in shown)
+        return hashlib.sha256(self.digest().encode() + b"".join(parts)).hexdigest()
+
     def text(self) -> str:
         """What a run's manifest has of this world, beside its settings."""
         sizes = f"{self.num_states} states, {self.num_actions} actions"

@@ -41,15 +41,16 @@ class Budget:
     def add(self, size: int) -> None:
         """Another state was found, whose copy has so many bytes."""
         search, self.num_bytes = self._search, self.num_bytes + size
+        num_bytes = self.num_bytes + search.seen.num_bytes
         if len(search.states) > self.most_now:
             raise search.refusal(
                 f"more than {self.most_now:,} states can be reached, too many to solve, since its "
                 f"{self.what_changes()}"
             )
-        if self.num_bytes > _MOST_BYTES:
+        if num_bytes > _MOST_BYTES:
             most = f"{_MOST_BYTES / 2**30:.0f} GiB"
             raise search.refusal(f"copies of the first {len(search.states):,} states take more than {most}")
-        check_memory(search.where, self.num_bytes)
+        check_memory(search.where, num_bytes)
 
     def check_seconds(self) -> None:
         """Refuse to go on where its time is over."""

@@ -23,6 +23,10 @@ ATOMS = frozenset({type(None), bool, int, float, complex, str, bytes, *np.sctype
 _CONTAINERS = (list, tuple, dict, set, frozenset, np.ndarray)  # whose own reduction holds their items
 
 
+class ViewsShared(BaseException):  # which an environment's `except Exception` does not catch
+    """Two arrays show the same memory, so that a copy has to hold it once."""
+
+
 class Copier(pickle.Pickler):
     """Copies what no attribute left in place shares a list or a dictionary with."""
 
@@ -43,9 +47,11 @@ class Copier(pickle.Pickler):
 
     def _taken_apart(self, obj: Any) -> Any:
         if isinstance(obj, np.ndarray):
+            if self._held.keeps_views:
+                return _parts_of_view(obj) if isinstance(obj.base, np.ndarray) else NotImplemented
             views = self._views.setdefault(id(obj if obj.base is None else obj.base), [])
             if any(np.may_share_memory(obj, each) for each in views):
-                raise TypeError("two arrays share memory; hold one of them")
+                raise ViewsShared
             views.append(obj)
         elif _is_taken_apart(kind_of(obj)):
             held = attributes(obj)
@@ -99,6 +105,13 @@ class Reader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         ours = (module, name) == (_kept.__module__, _kept.__name__)
         return self.persistent_load if ours else super().find_class(module, name)
+
+
+def _parts_of_view(view: np.ndarray[Any, Any]) -> Any:
+    """What makes a view again, on a copy of the array whose memory it shows."""
+    base: Any = view.base
+    offset = view.__array_interface__["data"][0] - base.__array_interface__["data"][0]
+    return np.ndarray, (view.shape, view.dtype, base, offset, view.strides)
 
 
 def _kept(key: Any) -> Any:

@@ -9,8 +9,11 @@ from functools import lru_cache
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium import wrappers
+from gymnasium.utils import seeding
 
+Named = tuple[str, tuple[str, int, int] | None]  # what a reader calls a state, and its place
 # Wrappers that change neither what is seen nor what happens; the second row is of others, if imported.
 _NEUTRAL = (
     wrappers.AddWhiteNoise,
@@ -84,17 +87,18 @@ def is_kept(kind: type) -> bool:
     return _is_kept(kind, _loaded(_KEPT))
 
 
-def place_of(env: Any) -> tuple[str, tuple[str, int, int]] | None:
+def place_of(env: Any, with_step: bool) -> Named:
     """The name of a state of MiniGrid's environments, and its place: which way, row and column."""
     place, direction = (getattr(env, name, None) for name in ("agent_pos", "agent_dir"))
     try:
         column, row = (int(each) for each in place)  # type: ignore[union-attr]
         facing = f"facing {_FACING[direction]}"  # type: ignore[index]
     except (TypeError, ValueError, IndexError):
-        return None
+        return "", None
     if carried := getattr(getattr(env, "carrying", None), "type", None):
         facing += f", carrying a {carried}"
-    return f"row {row + 1}, column {column + 1}, {facing}", (facing, row, column)
+    step = f", step {getattr(env, 'step_count', '?')}" if with_step else ""
+    return f"row {row + 1}, column {column + 1}, {facing}{step}", (facing, row, column)
 
 
 def _hands(env: Any) -> Any:
@@ -144,11 +148,14 @@ _PATCHES: tuple[tuple[tuple[str, str], str, Callable[..., Any]], ...] = (
 
 
 @contextmanager
-def patched(env: Any) -> Iterator[None]:
-    """Put these in place."""
-    found = [
+def patched(env: Any, branching: Any) -> Iterator[None]:
+    """Put these in place; and `branching` in place of each generator that is made without a seed."""
+    found: list[tuple[Any, str, Any]] = [
         (kind, *patch) for known, *patch in _PATCHES for kind in _loaded((known,)) if isinstance(env, kind)
     ]
+    generator, pair = np.random.default_rng, seeding.np_random
+    found.append((np.random, "default_rng", lambda seed=None: branching if seed is None else generator(seed)))
+    found.append((seeding, "np_random", lambda seed=None: (branching, 0) if seed is None else pair(seed)))
     originals = [(kind, name, getattr(kind, name)) for kind, name, _ in found]
     for kind, name, method in found:
         setattr(kind, name, method)

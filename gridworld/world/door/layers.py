@@ -27,7 +27,6 @@ import numpy as np
 from gridworld.base.errors import InputError, in_short
 from gridworld.world.door import known
 from gridworld.world.door.attributes import (
-    GENERATORS,
     attributes,
     generators_of,
     holders_of,
@@ -42,14 +41,13 @@ from gridworld.world.door.attributes import (
 from gridworld.world.door.copies import ATOMS, Copier, Reader, Recorder, SharedCopier
 from gridworld.world.door.stand_ins import Limited, Recorded, Timed
 from gridworld.world.door.uniform import Uniform
-from gridworld.world.door.unread import NUMBERS, Unread
+from gridworld.world.door.unread import NUMBERS, Counter, Unread
 
 Env = gym.Env[Any, Any]
 _CODE = (type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, np.ufunc)
-_KEPT = (gym.Space, gym.envs.registration.EnvSpec, *_CODE)
+KEPT = (gym.Space, gym.envs.registration.EnvSpec, *_CODE)
 _SMALL, _LARGE = 1024, 256  # bytes of all copies, up to which all is copied; beyond it, of one attribute
 _PLAIN = frozenset({list, tuple, dict, set, frozenset, collections.deque})
-_MARK = object()  # in place of any generator
 
 
 class Changed(Exception):  # noqa: N818
@@ -73,12 +71,19 @@ class Layers:
         branching: the generator in place of every other.
         counts_time: whether the count of a `TimeLimit` is state too, since something reads it.
         keeps_shared: whether objects that its modules and classes hold are kept as they are.
+        keeps_views: whether an array that shows another's memory does so in copies, too.
     """
 
     def __init__(
-        self, where: str, env: Env, branching: Any, counts_time: bool = False, keeps_shared: bool = True
+        self,
+        where: str,
+        env: Env,
+        branching: Any,
+        counts_time: bool = False,
+        keeps_shared: bool = True,
+        keeps_views: bool = False,
     ) -> None:
-        self._where, self.branching = where, branching
+        self._where, self.branching, self.keeps_views = where, branching, keeps_views
         self.limit: int | None = None
         self.layers: list[Any] = []
         self.limited: Limited | None = None  # in place of a time limit below a wrapper
@@ -113,8 +118,8 @@ class Layers:
         self._left: list[list[tuple[str, Any]]] = [[] for _ in self.layers]  # in place, by layers
         self._digest_left = b""
         self.read: set[tuple[int, str]] = set()  # attributes that something has read
-        self.unread: set[tuple[int, str]] = set()  # numbers that change, and that nothing has read so far
-        self._stand_ins: dict[tuple[int, str], Unread] = {}
+        self.counters: dict[tuple[int, str], Counter] = {}  # numbers that change, and that nothing has read
+        self._compares_forms = False  # whether what a stand-in was made from counts in a copy
         # Those that cannot be replaced, with their states.
         self._generators = [(each, state_of(each)) for each in generators_of(holders)]
         self.is_adopting = False
@@ -132,7 +137,7 @@ class Layers:
             self._adopt()
             for space, _ in spaces:
                 vars(space)["_np_random"] = self.branching
-            with known.patched(self.base):
+            with known.patched(self.base, self.branching):
                 yield
         finally:
             for layer, held in before:
@@ -207,16 +212,18 @@ class Layers:
                     )
         return InputError(f"{self._where}: its attributes cannot be copied ({in_short(error)})")
 
-    def leave(self, changing: set[tuple[int, str]]) -> None:
+    def leave(self, changing: set[tuple[int, str]], series: Sequence[Sequence[dict[Any, Any]]]) -> None:
         """Leave in place what is not known to change: single values, and what is large if all of it is.
 
-        A stand-in takes the place of each number that changes and that nothing has read so far.
+        A stand-in takes the place of each number that changes and that nothing has read so far; `series`
+        has the numbers in some episodes, after the reset and each step.
         """
         self._left, self._known, self._shares = [[] for _ in self.layers], self.fixed, False
-        self.unread = changing - self.read
-        for key in self.unread - self._stand_ins.keys():
-            self._keep(stand_in := Unread(*key))
-            self._stand_ins[key] = stand_in
+        self.counters = {}
+        for key in changing - self.read:
+            values = [[now[key] for now in each if key in now] for each in series]
+            self.counters[key] = counter = Counter(key, values)
+            self._keep(counter.blank)
         held = [
             (number, name, value)
             for number, layer in enumerate(self.layers)
@@ -271,15 +278,34 @@ class Layers:
                 if now is not value and not (type(now) is type(value) in ATOMS and now == value):
                     raise Changed([(number, name)])
             for name in found:
-                if (number, name) in self.unread and type(found[name]) in NUMBERS:
-                    found[name] = self._stand_ins[number, name]
+                counter = self.counters.get((number, name))
+                if counter is not None and (type(found[name]) in NUMBERS or type(found[name]) is Unread):
+                    found[name] = counter.blank
             held.append(sorted((item for item in found.items() if item[0] not in without), key=itemgetter(0)))
         return held
 
-    def put(self, copy: bytes) -> None:
-        """Make a copy the state of all layers."""
-        for layer, items, left in zip(self.layers, self._load(copy), self._left, strict=True):
-            set_attributes(layer, dict(items + left))
+    def put(self, copy: bytes, is_step_next: bool = True) -> None:
+        """Make a copy the state of all layers; numbers that are counted may be compared in a step alone."""
+        held = [dict(items + left) for items, left in zip(self._load(copy), self._left, strict=True)]
+        for (number, name), counter in self.counters.items():
+            if is_step_next and type(held[number].get(name)) is Unread:
+                held[number][name] = counter.fresh()
+        for layer, content in zip(self.layers, held, strict=True):
+            set_attributes(layer, content)
+
+    def check_counters(self, is_reset: bool) -> None:
+        """Note how numbers that are counted have changed in a reset or a step."""
+        for (number, name), counter in self.counters.items():
+            counter.check(attributes(self.layers[number]).get(name), is_reset)
+
+    def numbers(self) -> dict[tuple[int, str], Any]:
+        """The attributes that are numbers."""
+        return {
+            (number, name): value
+            for number, layer in enumerate(self.layers)
+            for name, value in attributes(layer).items()
+            if type(value) in NUMBERS
+        }
 
     def check_shared(self) -> None:
         """Raise `SharedChanged` if an object that is kept for its modules and classes has changed."""
@@ -303,7 +329,11 @@ class Layers:
 
     def everything(self, *more: Any) -> bytes:
         """A copy of every attribute, and of `more`; what cannot be copied raises whatever it raises."""
-        return self._dump([*more, *(attributes(layer) for layer in self.layers)], self.fixed)
+        self._compares_forms = True
+        try:
+            return self._dump([*more, *(attributes(layer) for layer in self.layers)], self.fixed)
+        finally:
+            self._compares_forms = False
 
     def copy_of(self, thing: Any) -> bytes:
         """A copy of something that may hold the layers."""
@@ -345,7 +375,13 @@ class Layers:
         kind = type(thing)
         if kind is Uniform:
             return "drawn", *thing.parts()
-        if isinstance(thing, _KEPT) or known.is_kept(kind):
+        if kind is Unread:
+            return (
+                self._keep(thing.counter.blank)
+                if not self._compares_forms
+                else (*thing.counter.key, thing.form)
+            )
+        if isinstance(thing, KEPT) or known.is_kept(kind):
             return self._keep(thing)
         if isinstance(thing, np.random.Generator):
             if not self.is_adopting:
@@ -362,13 +398,3 @@ class Layers:
             return self._keep(thing) if not thing.flags.writeable and thing.base is None else None
         self.ordinary.add(kind)
         return None
-
-
-def contents(env: Env) -> dict[str, bytes]:
-    """The content of each attribute of an environment, to compare it with another's."""
-    layers = Layers("env", env.unwrapped, _MARK)
-    layers.is_adopting = True
-    skipped = {
-        name for name, value in attributes(layers.base).items() if isinstance(value, (*_KEPT, *GENERATORS))
-    }
-    return {name: value for (_, name), value in layers.values([*skipped, "_np_random_seed"]).items()}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -11,6 +13,43 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError, on_a_line
+
+_LONGEST_NAME = 60  # of a state that is called by its observation
+
+
+class Seen:
+    """The observations that were met, by their digests.
+
+    Args:
+        space: of the observations.
+        refusal: makes an error of a reason.
+    """
+
+    def __init__(self, space: gym.Space[Any], refusal: Callable[[str], InputError]) -> None:
+        self._space, self._refusal = space, refusal
+        self.parts: dict[bytes, Any] = {}
+        self.texts: dict[bytes, str] = {}  # empty where they are long
+        self.num_bytes = 0
+        self._met: dict[Any, bytes] = {}  # the digests of numbers, and of tuples of such
+
+    def digest(self, observation: Any) -> bytes:
+        """A digest of an observation as a learner gets it, in the types of its space."""
+        may_be_met = type(observation) in (int, tuple, np.int64)
+        with contextlib.suppress(TypeError):  # of a tuple of what has no hash
+            if may_be_met and (met := self._met.get(observation)):
+                return met
+        parts = list(leaves(observation, self._space, self._refusal))  # whose sizes are known
+        whole = b"".join(each.tobytes() if isinstance(each, np.ndarray) else each for each in parts)
+        seen = whole if len(whole) <= 16 else hashlib.blake2b(whole, digest_size=17).digest()
+        if seen not in self.parts:
+            self.parts[seen] = parts
+            text = " ".join(str(observation).split())
+            self.texts[seen] = f"observation {text}" if len(text) <= _LONGEST_NAME else ""
+            self.num_bytes += sum(each.nbytes for each in parts if isinstance(each, np.ndarray))
+        with contextlib.suppress(TypeError):
+            if may_be_met and all(isinstance(each, np.ndarray) for each in parts):  # by numbers alone
+                self._met[observation] = seen
+        return seen
 
 
 def leaves(observation: Any, space: gym.Space[Any], refusal: Callable[[str], InputError]) -> Iterator[Any]:

@@ -2,10 +2,10 @@
 
 A draw that is made again at the same place of a `while` loop, with nothing changed since, is a rejection:
 what follows it follows the earlier draw as well. "Nothing" is every attribute of all layers and every local
-variable of the functions between. Draws in `for` loops and comprehensions, whose iterators nobody sees, and
-draws that are not plain calls are never taken for one. What is held elsewhere (in classes, globals, half a
-sum) is not seen: so each step in which a draw was rejected is also run with numpy's own generator, and the
-shares are compared.
+variable of the functions between. Draws in comprehensions and in `for` loops over anything but a `range`,
+whose iterators nobody sees, and draws that are not plain calls are never taken for one. What is held
+elsewhere (in classes, globals, half a sum) is not seen: so each step in which a draw was rejected is also run
+with numpy's own generator, and the shares are compared.
 """
 
 from __future__ import annotations
@@ -185,11 +185,12 @@ class Rejecting(Branching):
             frame = frame.f_back
         places, held = [], []
         while frame is not None and frame.f_code not in self._runs:
-            code, at = frame.f_code, frame.f_lasti
-            if not self._is_plain(code, at, name):
+            code, at, variables = frame.f_code, frame.f_lasti, frame.f_locals
+            around = _ranges_around(code, at) if _calls(code, at, name) else None
+            if around is None or any(each not in variables for each in around):
                 return None
             places.append((code, at))
-            held.append(frame.f_locals)
+            held.append(variables)
             name, frame = code.co_name, frame.f_back
         if not any(_in_while(code, at) for code, at in places):
             return None
@@ -197,10 +198,6 @@ class Rejecting(Branching):
             return tuple(places), self._everything(*held)
         except Exception:  # whatever cannot be copied
             return None
-
-    @staticmethod
-    def _is_plain(code: CodeType, at: int, name: str) -> bool:
-        return not _in_for(code, at) and _calls(code, at, name)
 
     def _merged(self, step: Callable[[], Any]) -> tuple[dict[Any, Fraction], Any]:
         """Outcomes where what comes again counts as what it was; and the places where draws came again.
@@ -296,30 +293,58 @@ for _name in _DRAWS:
 
 
 @functools.lru_cache(4096)
-def _in_for(code: CodeType, at: int) -> bool:
-    """Whether an instruction is in a `for` loop or a comprehension."""
-    loops = (each for each in dis.get_instructions(code) if each.opname == "FOR_ITER")
-    return any(each.offset <= at < each.argval for each in loops)
+def _ranges_around(code: CodeType, at: int) -> tuple[str, ...] | None:
+    """The variables of the `for` loops around an instruction, each over a `range`, which gives none twice.
+
+    None if there is a loop of another kind, whose iterator nobody sees, or one that sets its variable.
+    """
+    found = list(dis.get_instructions(code))
+    names = []
+    for place, loop in enumerate(found):
+        if loop.opname == "FOR_ITER" and loop.offset <= at < loop.argval:
+            store = found[place + 1]
+            inside = [each for each in found if loop.offset < each.offset < loop.argval]
+            num_stores = sum(each.argval == store.argval and "STORE" in each.opname for each in inside)
+            is_range = found[place - 1].opname == "GET_ITER" and _is_range(code, found[place - 2].offset)
+            if not is_range or store.opname != "STORE_FAST" or num_stores != 1:
+                return None
+            names.append(store.argval)
+    return tuple(names)
+
+
+def _is_range(code: CodeType, at: int) -> bool:
+    """Whether an instruction is a `range` of what is seen: of numbers, variables and attributes."""
+    tree = _expression(code, at)
+    is_range = isinstance(tree, ast.Call) and isinstance(tree.func, ast.Name) and tree.func.id == "range"
+    return is_range and sum(isinstance(each, ast.Call) for each in ast.walk(tree)) == 1  # type: ignore[arg-type]
 
 
 @functools.lru_cache(4096)
 def _in_while(code: CodeType, at: int) -> bool:
-    """Whether an instruction is in a loop: one behind it leads back to before it."""
+    """Whether an instruction is in a `while` loop: one behind it leads back to before it."""
+    heads = {each.offset for each in dis.get_instructions(code) if each.opname == "FOR_ITER"}
     jumps = (each for each in dis.get_instructions(code) if "JUMP" in each.opname and each.offset > at)
-    return any(isinstance(each.argval, int) and each.argval <= at for each in jumps)
+    return any(
+        isinstance(each.argval, int) and each.argval <= at and each.argval not in heads for each in jumps
+    )
 
 
 @functools.lru_cache(4096)
 def _calls(code: CodeType, at: int, name: str) -> bool:
     """Whether an instruction is a plain call `f(...)` or `x.f(...)` of that name, with no C code between."""
+    tree = _expression(code, at)
+    return isinstance(tree, ast.Call) and getattr(tree.func, "attr", getattr(tree.func, "id", None)) == name
+
+
+def _expression(code: CodeType, at: int) -> ast.expr | None:
+    """What an instruction is of, by its file."""
     line, end, left, right = list(code.co_positions())[at // 2]
     if line is None or end is None or left is None or right is None:
-        return False
+        return None
     lines = [linecache.getline(code.co_filename, number) for number in range(line, end + 1)]
     text = "".join(lines).encode()
     after = len(lines[-1].encode()) - right if lines else 0
     try:
-        tree = ast.parse(b"(" + text[left : len(text) - after] + b")", mode="eval").body
+        return ast.parse(b"(" + text[left : len(text) - after] + b")", mode="eval").body
     except (SyntaxError, ValueError):
-        return False
-    return isinstance(tree, ast.Call) and getattr(tree.func, "attr", getattr(tree.func, "id", None)) == name
+        return None

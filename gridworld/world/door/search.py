@@ -7,7 +7,6 @@ is tried from every state and end too: it must always lead to the same.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import itertools
@@ -16,7 +15,6 @@ import pickle
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any
 
 import gymnasium as gym
@@ -24,16 +22,17 @@ import numpy as np
 from gymnasium import spaces
 
 from gridworld.base.errors import GYMNASIUM, InputError, in_short, on_a_line
-from gridworld.world.door import known
+from gridworld.world.door import known, limits
 from gridworld.world.door.beliefs import Step, lumped
 from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES, SAMPLED, Budget
 from gridworld.world.door.clock import watched
+from gridworld.world.door.copies import ViewsShared
 from gridworld.world.door.episodes import check_by_episodes, check_by_word
 from gridworld.world.door.layers import Changed, Env, Layers, SharedChanged
-from gridworld.world.door.observations import leaves
+from gridworld.world.door.observations import Seen
 from gridworld.world.door.rejection import Rejecting
 from gridworld.world.door.resets import Resets
-from gridworld.world.door.stand_ins import Limited, Timed
+from gridworld.world.door.stand_ins import Timed
 from gridworld.world.door.unread import Read
 from gridworld.world.door.walks import walk
 from gridworld.world.outcomes import MOST_ACTIONS
@@ -42,7 +41,6 @@ OVER = -1  # in place of the state in which an episode ends
 _BEYOND = 1_000  # states further than a step limit that are found too, so that a small world is whole
 _BATCH = 1_000  # states that are tried before a reset is tried from each of them
 _DEEPEST = 10_000  # steps from the start
-_LONGEST_NAME = 60  # of a state that is called by its observation
 _NOT_REPEATED = (
     "it does not repeat a walk with the same random numbers, so it depends on more than its attributes and "
     "np_random: another generator, a clock, a file, something global"
@@ -51,7 +49,6 @@ _INTS = (
     "it answers an action that is an int in another way than np.int64, which learners send; take both alike, "
     "e.g. by int(action)"
 )
-Named = tuple[str, tuple[str, int, int] | None]  # what a reader calls a state, and its place
 Result = tuple[int, bytes, float, bool, bool]
 
 
@@ -106,15 +103,13 @@ class Search:
             )
         self.num_actions = int(actions.n)
         try:
-            self.has_masks = isinstance(env, gym.Wrapper) and env.has_wrapper_attr("action_masks")
-            self.has_masks = self.has_masks or hasattr(env, "action_masks")
+            has_masks = isinstance(env, gym.Wrapper) and env.has_wrapper_attr("action_masks")
+            self.has_masks = has_masks or hasattr(env, "action_masks")
         except Exception as error:  # of its own
-            raise self.refusal(
-                f"its __getattr__ raises {in_short(error)}, must raise AttributeError"
-            ) from error
-        self.observations: dict[bytes, Any] = {}  # by their digests
-        self.shown: dict[bytes, str] = {}  # the same as short texts
-        self._met: dict[Any, bytes] = {}  # the digests of numbers, and of tuples of such
+            reason = f"its __getattr__ raises {in_short(error)}, must raise AttributeError"
+            raise self.refusal(reason) from error
+        self.seen = Seen(env.observation_space, self.refusal)
+        self.is_cutting = False  # whether steps are tried as they are at a limit
         self.limit_met: int | None = None  # the time at which it cuts episodes, where the time is no state
         self.budget = Budget(self, most_states, most_seconds)
 
@@ -124,28 +119,35 @@ class Search:
 
     def explore(self) -> None:
         """Find all states that can be reached, and what every action does there."""
-        counts_time, keeps_shared, is_done = False, True, False
+        how = {"counts_time": False, "keeps_shared": True, "keeps_views": False}
         with watched() as self.clock_readers:
-            while not is_done:
+            while not self.budget.is_explored:
                 try:
-                    self._explored(counts_time, keeps_shared)
-                    is_done = self.budget.is_explored = True
+                    self._explored(**how)
+                    self.budget.is_explored = True
                 except SharedChanged:
-                    keeps_shared = False
+                    how["keeps_shared"] = False
+                except ViewsShared:
+                    how["keeps_views"] = True
                 except (_Missing, Timed):  # something reads what is around it: a time limit's count, say
-                    counts_time = True
+                    how["counts_time"] = True
 
-    def _explored(self, counts_time: bool, keeps_shared: bool) -> None:
+    def _explored(self, **how: bool) -> None:
         runs = (Search.reset_from.__code__, Search.stepped_from.__code__)
         self.branching = Rejecting(self.where, self._everything, runs, self._read is not None, self._compares)
         self.branching.until = time.monotonic() + self.budget.seconds_left()
-        self.layers = layers = Layers(self.where, self.env, self.branching, counts_time, keeps_shared)
-        self._is_complete = counts_time  # nothing that an environment may read is left out
+        self.layers = layers = Layers(self.where, self.env, self.branching, **how)
+        self._is_complete = how["counts_time"]  # nothing that an environment may read is left out
         with layers.restored():
             self.begin, before = layers.take(), layers.values()
             changing: set[tuple[int, str]] = set()
+            series: list[list[dict[Any, Any]]] = [[]]  # the numbers in each walk
 
-            def look() -> None:
+            def look(is_over: bool) -> None:
+                if not is_over:
+                    series[-1].append(layers.numbers())
+                    return
+                series.append([])
                 after = layers.values()
                 changing.update(each for each in before | after if before.get(each) != after.get(each))
 
@@ -157,13 +159,13 @@ class Search:
                     raise self.refusal(mistake)
             while True:
                 layers.put(self.begin)
-                layers.leave(changing)
+                layers.leave(changing, series)
                 try:
-                    if layers.unread:
+                    if layers.counters:
                         if walk(self, np.int64) != as_sent:
-                            raise Read(layers.unread)
+                            raise Read(set(layers.counters))
                         layers.put(self.begin)
-                    self._explore(layers.limit)
+                    self._explore()
                     layers.check_left()
                     layers.check_shared()
                     if self.ignore or self._read is not None:
@@ -197,9 +199,10 @@ class Search:
             return self.layers.everything(*held)
         return self.layers.copy_of((self._read(self.layers.base), held))
 
-    def _explore(self, limit: int | None) -> None:
+    def _explore(self) -> None:
         self.states: list[State] = []
-        self.ends: dict[bytes, Named] = {}  # what ends are called, by their observations
+        self.num_tried = 0
+        self.ends: dict[bytes, known.Named] = {}  # what ends are called, by their observations
         self._by_copy: dict[bytes, State] = {}
         self._ended: set[bytes] = set()
         self._waiting_ends: list[bytes] = []  # copies of new ends, from which no reset was tried yet
@@ -224,6 +227,7 @@ class Search:
         size = checked = 0  # of the states in `waiting`, those from which a reset was tried
         for place, state in enumerate(waiting):  # which grows
             budget.show(f"{len(self.states):,} states, {place:,} of them tried")
+            limit = limits.met(self)
             if beyond is None and state.depth >= (limit or _DEEPEST):
                 if limit is None:
                     still = f"after {_DEEPEST:,} steps it still finds new states"
@@ -234,7 +238,7 @@ class Search:
                 budget.most_now = most_states
                 state.steps = self._tried(state)
                 steps = itertools.chain.from_iterable(state.steps)
-                self.open(each.following for each in steps if not (each.terminated or each.truncated))
+                self.open(each.following for each in steps if each.following != OVER)
                 if place + 1 == len(waiting) or place + 1 - checked >= _BATCH:
                     self._check_resets(waiting[checked : place + 1])
                     checked = place + 1
@@ -261,7 +265,7 @@ class Search:
     # ---- runs ----
 
     def reset_from(self, copy: bytes) -> Result:
-        self.layers.put(copy)
+        self.layers.put(copy, is_step_next=False)
         try:
             returned = self.layers.env.reset(**self.layers.reset_options)
         except Exception as error:  # whatever it raises
@@ -285,27 +289,25 @@ class Search:
             raise self.refusal(f"step() returns {on_a_line(returned)}, as in the old Gym: {GYMNASIUM}")
         observation, reward, terminated, truncated, _ = returned
         if np.ndim(reward):
-            raise self.refusal(
-                f"a step with action {action} pays an array of shape {np.shape(reward)}; must be a number"
-            )
+            shape = f"an array of shape {np.shape(reward)}; must be a number"
+            raise self.refusal(f"a step with action {action} pays {shape}")
         try:
             paid = float(reward)
         except (TypeError, ValueError):
             paid = math.nan
         if not math.isfinite(paid):
-            raise self.refusal(
-                f"a step with action {action} pays {on_a_line(reward)}; must be a finite number"
-            )
-        is_over = bool(terminated)
-        return *self.state_after(observation, depth + 1, is_over), paid, is_over, bool(truncated)
+            number = f"{on_a_line(reward)}; must be a finite number"
+            raise self.refusal(f"a step with action {action} pays {number}")
+        is_over = bool(terminated or truncated)
+        return *self.state_after(observation, depth + 1, is_over), paid, bool(terminated), bool(truncated)
 
     def _failed(self, what: str, error: Exception) -> Exception:
         if isinstance(error, InputError):
             return error
         if isinstance(error, AttributeError) and not self._is_complete:
             return _Missing()
-        if unread := self.layers.unread:  # which may be why
-            raise Read(unread)
+        if self.layers.counters:  # which may be why
+            raise Read(set(self.layers.counters))
         return self.refusal(f"{what} fails: {in_short(error)}")
 
     def _tried(self, state: State) -> list[list[Step]]:
@@ -315,8 +317,8 @@ class Search:
             self.merged(functools.partial(self.stepped_from, state.copy, state.depth, np.int64(action)))
             for action in range(self.num_actions)
         ]
-        if self.layers.limited is not None and self.layers.may_see_cuts:
-            self._check_cut(state, steps, self.layers.limited)
+        limits.check(self, state, steps)
+        self.num_tried += 1
         if state.mask is not None:
             self.layers.put(state.copy)
             if self._mask() != state.mask:
@@ -349,34 +351,17 @@ class Search:
         found = self.branching.outcomes(run)
         return [Step(probability, *result) for result, probability in found.items()]
 
-    def _check_cut(self, state: State, steps: list[list[Step]], limited: Limited) -> None:
-        """A wrapper around a time limit must pass the cut on, and otherwise do what it does without."""
-        limited.cuts = True
-        try:
-            for action, usual in enumerate(steps):
-                run = functools.partial(self.stepped_from, state.copy, state.depth, np.int64(action))
-                cut: dict[Any, Fraction] = {}
-                for (_, *shown), probability in self.branching.outcomes(run).items():
-                    key = (*shown[:3], shown[2] or shown[3])
-                    cut[key] = cut.get(key, Fraction(0)) + probability
-                whole: dict[Any, Fraction] = {}
-                for each in usual:
-                    key = (each.seen, each.reward, each.terminated, True)
-                    whole[key] = whole.get(key, Fraction(0)) + each.probability
-                if cut != whole:
-                    raise Timed
-        finally:
-            limited.cuts = False
-
     # ---- states ----
 
     def state_after(self, observation: Any, depth: int, is_over: bool = False) -> tuple[int, bytes]:
         """The number of the state that the environment is in, and a digest of the observation."""
-        seen = self.see(observation)
+        seen = self.seen.digest(observation)
         if is_over and seen not in self.ends:
-            self.ends[seen] = self._named()
-        if self.layers.limited is not None and self.layers.limited.cuts:
+            self.ends[seen] = known.place_of(self.layers.base, "step_count" not in self.ignore)
+        if self.is_cutting:
             return OVER, seen
+        if not is_over and self.branching.sampling is None:
+            self.layers.check_counters(is_reset=depth == 0)
         if self._read is not None:
             key = pickle.dumps(self._read(self.layers.base))
         else:
@@ -402,7 +387,7 @@ class Search:
             raise self.refusal(f"its state cannot be copied: {in_short(error)}") from error
 
     def _added(self, copy: bytes, depth: int) -> State:
-        name, place = self._named()
+        name, place = known.place_of(self.layers.base, "step_count" not in self.ignore)
         state = State(len(self.states), depth, copy, name, place)
         if self.has_masks:
             state.mask = self._mask()
@@ -413,33 +398,3 @@ class Search:
     def _mask(self) -> tuple[bool, ...]:
         masks = self.env.get_wrapper_attr("action_masks")()
         return tuple(bool(each) for each in np.reshape(masks, -1))
-
-    def _named(self) -> Named:
-        """What a reader calls its state, and its place."""
-        found = known.place_of(self.layers.base)
-        if found is None:
-            return "", None
-        name, place = found
-        shown = (
-            "" if "step_count" in self.ignore else f", step {getattr(self.layers.base, 'step_count', '?')}"
-        )
-        return f"{name}{shown}", place
-
-    def see(self, observation: Any) -> bytes:
-        """A digest of an observation as a learner gets it, in the types of its space."""
-        may_be_met = type(observation) in (int, tuple, np.int64)
-        with contextlib.suppress(TypeError):  # of a tuple of what has no hash
-            if may_be_met and (met := self._met.get(observation)):
-                return met
-        parts = list(leaves(observation, self.env.observation_space, self.refusal))  # whose sizes are known
-        whole = b"".join(each.tobytes() if isinstance(each, np.ndarray) else each for each in parts)
-        seen = whole if len(whole) <= 16 else hashlib.blake2b(whole, digest_size=17).digest()
-        if seen not in self.observations:
-            self.observations[seen] = parts
-            shown = " ".join(str(observation).split())
-            self.shown[seen] = f"observation {shown}" if len(shown) <= _LONGEST_NAME else ""
-            self.budget.num_bytes += sum(each.nbytes for each in parts if isinstance(each, np.ndarray))
-        with contextlib.suppress(TypeError):
-            if may_be_met and all(isinstance(each, np.ndarray) for each in parts):  # by numbers alone
-                self._met[observation] = seen
-        return seen

@@ -1,56 +1,174 @@
-"""What stands for a number that is counted or summed up and that nothing ever reads.
+"""What stands for a number that is counted or summed up and that nothing reads, or only to cut episodes.
 
-A counter of all resets, say, or the sum of an episode's rewards that only `info` tells: as state it would
+A counter of all resets, say, or the sum of an episode's rewards that only `info` shows: as state it would
 multiply the others without end. So each number that changes is replaced by a stand-in before every run, which
-may be counted on and passed around. Whatever else is done with one raises `Read`, and then it is state.
+may be counted on and passed around. A number that grows by the same in every step, as a count of them, may be
+compared with others too: if the comparison does nothing but truncate, its moment is a step limit. Whatever
+else is done with a stand-in raises `Read`, and then the number is state.
 """
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
 
-NUMBERS = frozenset({int, float, *(kind for kind in np.sctypeDict.values() if issubclass(kind, np.number))})
-_COUNTING = ("add", "radd", "sub", "rsub", "mul", "rmul")
+NUMBERS = frozenset(
+    {int, float, *(k for k in np.sctypeDict.values() if issubclass(k, np.integer | np.floating))}
+)
+_EXACT = 2**50  # floats up to it are counted exactly
+Key = tuple[int, str]  # of an attribute: its layer's number, and its name
 _READING = (
     *("bool", "int", "float", "complex", "index", "len", "iter", "contains", "getitem", "call", "array"),
-    *("eq", "ne", "lt", "le", "gt", "ge", "hash", "str", "repr", "format", "bytes", "round", "trunc"),
-    *("floor", "ceil", "abs", "neg", "pos", "invert", "getattr", "reversed", "divmod", "rdivmod"),
+    *("hash", "str", "repr", "format", "bytes", "round", "trunc", "floor", "ceil", "abs", "neg", "pos"),
+    *("invert", "getattr", "reversed", "divmod", "rdivmod"),
     *(f"{right}{name}" for name in ("truediv", "floordiv", "mod", "pow") for right in ("", "r")),
     *(f"{right}{name}" for name in ("and", "or", "xor", "lshift", "rshift", "matmul") for right in ("", "r")),
 )
+_COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")
+_MIRRORED = {"lt": "gt", "gt": "lt", "le": "ge", "ge": "le"}
+_OF_NUMPY: dict[Any, str] = {
+    getattr(np, name): short
+    for name, short in (
+        *(("add", "add"), ("subtract", "sub"), ("multiply", "mul"), ("less", "lt"), ("less_equal", "le")),
+        *(("greater", "gt"), ("greater_equal", "ge"), ("equal", "eq"), ("not_equal", "ne")),
+    )
+}
 
 
 class Read(BaseException):  # which an environment's `except Exception` does not catch
     """Something depends on attributes that seemed to be read by nothing: a layer's number, and a name."""
 
-    def __init__(self, found: set[tuple[int, str]]) -> None:
+    def __init__(self, found: set[Key]) -> None:
         super().__init__(found)
         self.found = found
 
 
-class Unread:
-    """A number of which nobody has asked anything."""
+class Counter:
+    """What is known of an attribute in whose place there is a stand-in.
 
-    def __init__(self, layer: int, name: str) -> None:
-        self._of = layer, name
+    Args:
+        key: the attribute.
+        series: its values in some episodes, after the reset and each step.
+    """
+
+    def __init__(self, key: Key, series: Sequence[Sequence[Any]]) -> None:
+        self.key = key
+        self.blank = Unread(self, None)  # what a copy holds: it says nothing of what it was made from
+        self.start = self.step = 0  # after a reset, and what each step adds
+        self.cuts = False  # whether comparisons come out as they do at the limit
+        self.num_checked = 0  # of the states, those from which steps were tried at the limit, too
+        self.limits: set[int] = set()  # the steps in which a comparison comes out otherwise than before
+        self._outcomes: dict[Any, tuple[bool, int | None]] = {}
+        self.is_regular = self._fits(series)
+
+    def _fits(self, series: Sequence[Sequence[Any]]) -> bool:
+        """Whether all began with one whole number, and added another one in each step."""
+        long = [each for each in series if len(each) > 1]
+        if not long or not all(_is_whole(value) for each in series for value in each):
+            return False
+        self.start, self.step = int(long[0][0]), int(long[0][1]) - int(long[0][0])
+        return self.step != 0 and all(
+            value == self.start + self.step * took for each in series for took, value in enumerate(each)
+        )
+
+    def fresh(self) -> Unread:
+        """What stands for it when a run begins."""
+        return Unread(self, (1, 0) if self.is_regular else None)
+
+    def check(self, value: Any, is_reset: bool) -> None:
+        """Notes whether it is, after a reset or a step in which the episode goes on, what it was to be."""
+        if type(value) is Unread:
+            fits = value.counter is self and value.form == (1, self.step) and not is_reset
+        else:
+            fits = type(value) in NUMBERS and is_reset and value == self.start
+        if not fits and self.is_regular:
+            self.is_regular = False
+            if self._outcomes:
+                raise Read({self.key})
+
+    def compared(self, name: str, form: tuple[int, int], threshold: Any) -> bool:
+        """What a comparison gives before the step in which it changes, or in that one."""
+        case = name, form, threshold
+        if (found := self._outcomes.get(case)) is None:
+            found = self._outcomes[case] = self._changes(getattr(operator, name), form, threshold)
+            if found[1] is not None:
+                self.limits.add(found[1])
+            if len(self.limits) > 1:
+                raise Read({self.key})
+        usual, limit = found
+        return usual is not (self.cuts and limit is not None)
+
+    def _changes(
+        self, compare: Callable[[Any, Any], bool], form: tuple[int, int], threshold: Any
+    ) -> tuple[bool, int | None]:
+        """What a comparison gives in the first step, and in which one it gives the other, if in any."""
+        sign, offset = form
+
+        def outcome(step: int) -> bool:
+            return bool(compare(sign * (self.start + self.step * (step - 1)) + offset, threshold))
+
+        slope = sign * self.step
+        usual, crossing = outcome(1), int((threshold - sign * self.start - offset) // slope) + 1
+        near = [step for step in range(crossing - 1, crossing + 3) if step > 1 and outcome(step) is not usual]
+        return usual, min(near, default=None)
+
+
+class Unread:
+    """A number of which nobody has asked anything.
+
+    `form` says that it is the first times what the attribute was when the run began, plus the second.
+    """
+
+    def __init__(self, counter: Counter, form: tuple[int, int] | None) -> None:
+        self.counter, self.form = counter, form
 
     __class__ = property(lambda self: self._read())
 
-    def _counted(self, other: Any) -> Any:
-        return self if type(other) in NUMBERS or type(other) in (bool, Unread) else self._read()
+    def _counted(self, name: str, other: Any) -> Any:
+        if type(other) not in NUMBERS and type(other) not in (bool, Unread):
+            self._read()
+        if self.form is None or type(other) is Unread or name[-3:] == "mul" or not _is_whole(other):
+            return self.counter.blank
+        sign, offset = self.form
+        number = int(other)
+        if name in ("add", "radd"):
+            return Unread(self.counter, (sign, offset + number))
+        return Unread(self.counter, (sign, offset - number) if name == "sub" else (-sign, number - offset))
+
+    def _compared(self, name: str, other: Any) -> bool:
+        is_number = type(other) in NUMBERS and abs(other) <= _EXACT  # which no NaN is
+        if self.form is None or not is_number or not self.counter.is_regular:
+            self._read()
+        return self.counter.compared(name, self.form, other)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
-        if ufunc not in (np.add, np.subtract, np.multiply) or method != "__call__" or options:
+        name = _OF_NUMPY.get(ufunc)
+        if name is None or method != "__call__" or options:
             self._read()
-        return next(each for each in map(self._counted, inputs) if each is self)
+        one, other = inputs
+        if type(one) is Unread:
+            return getattr(one, f"__{name}__")(other)
+        mirrored = _MIRRORED.get(name, name) if name in _COMPARISONS else f"r{name}"
+        return getattr(other, f"__{mirrored}__")(one)
 
     def _read(self, *_: Any) -> NoReturn:
-        raise Read({self._of})
+        raise Read({self.counter.key})
 
 
-for _name in _COUNTING:
-    setattr(Unread, f"__{_name}__", Unread._counted)
+def _is_whole(number: Any) -> bool:
+    return bool(abs(number) <= _EXACT and number == int(number))
+
+
+def _method(work: Callable[..., Any], name: str) -> Callable[[Unread, Any], Any]:
+    return lambda self, other: work(self, name, other)
+
+
+for _name in ("add", "radd", "sub", "rsub", "mul", "rmul"):
+    setattr(Unread, f"__{_name}__", _method(Unread._counted, _name))
+for _name in _COMPARISONS:
+    setattr(Unread, f"__{_name}__", _method(Unread._compared, _name))
 for _name in _READING:
     setattr(Unread, f"__{_name}__", Unread._read)

@@ -3,6 +3,7 @@
     layers        what its wrappers and itself hold, copied and put back
     unread        numbers that are counted and that nothing reads are no state
     search        the states, and what each action does there
+    limits        step limits, which are no state
     rejection     the generator in place of its own, which takes every outcome of every draw
     beliefs       what observations leave open of the state; states that are alike are one
 
@@ -24,11 +25,12 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from gridworld.base.user_input import check_memory
-from gridworld.world.door.beliefs import Beliefs, Node
+from gridworld.world.door import limits
+from gridworld.world.door.beliefs import Beliefs, Node, Step
 from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES
-from gridworld.world.door.episodes import NO_LIMIT
+from gridworld.world.door.known import Named
 from gridworld.world.door.layers import Env
-from gridworld.world.door.search import Named, Search, State
+from gridworld.world.door.search import Search, State
 from gridworld.world.mdp import ENUMERATED, Mdp, taken
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.shown import of_learners, stacked
@@ -96,13 +98,13 @@ class _World:
             members.setdefault(number, []).append(state)
         self.members = [*(members[number] for number in range(len(members))), []]
         classes.append(len(members))  # what is over, as the last
+        limit, self._cuts_end = limits.of_world(search)
         first = [
-            [[each._replace(following=classes[each.following]) for each in row] for row in found[0].steps]
+            [[self._in_classes(each, classes) for each in row] for row in found[0].steps]
             for found in self.members[:-1]
         ]
         starts = [(each.probability, classes[each.following], each.seen) for each in search.resets.starts]
-        budget, limits = search.budget, (_own_limit(search), search.layers.limit)
-        limit = min((each for each in limits if each is not None), default=None)
+        budget = search.budget
         self.beliefs = beliefs = Beliefs(
             starts,
             [*first, []],
@@ -117,7 +119,7 @@ class _World:
         leaves: list[Any] = [None] * size
         masks = np.ones((size, search.num_actions), dtype=np.bool_)
         for node, number in reversed(list(zip(beliefs.nodes, numbers.tolist(), strict=True))):
-            named[number], leaves[number] = self._name(node), search.observations[node.seen]
+            named[number], leaves[number] = self._name(node), search.seen.parts[node.seen]
             masks[number] = self._mask(node)
         if isinstance(space, spaces.Discrete):
             leaves = [each or [np.array(space.start + n, space.dtype)] for n, each in enumerate(leaves)]
@@ -145,12 +147,16 @@ class _World:
         shown = taken(rows, mdp.number)
         self.found = Found(mdp, space, shown, masks[mdp.number] if search.has_masks else None)
 
+    def _in_classes(self, step: Step, classes: Sequence[int]) -> Step:
+        ends = step.terminated or (step.truncated and self._cuts_end)
+        return step._replace(following=classes[step.following], terminated=ends)
+
     def _numbers(self) -> tuple[NDArray[Any], int]:
         """The number of each node in the tables, the environment's own if it has such; how many there are."""
         space, nodes = self.search.env.observation_space, self.beliefs.nodes
         acting = [node.seen for node in nodes if node.rows]
         if isinstance(space, spaces.Discrete) and space.n <= MOST_STATES and len(set(acting)) == len(acting):
-            shown = [int(self.search.observations[node.seen][0]) - int(space.start) for node in nodes]
+            shown = [int(self.search.seen.parts[node.seen][0]) - int(space.start) for node in nodes]
             return np.array(shown), int(space.n)
         return np.arange(len(nodes)), len(nodes)
 
@@ -177,7 +183,7 @@ class _World:
         """What a reader calls a node: as its states, or by what is shown there."""
         found = {(each.name, each.place) for each in self._possible(node)} or {self.search.ends[node.seen]}
         name, place = found.pop() if len(found) == 1 else ("", None)
-        return name or self.search.shown[node.seen], place
+        return name or self.search.seen.texts[node.seen], place
 
     def _truth(self) -> str:
         ignored = f" without {', '.join(self.search.ignore)}, as you asked" if self.search.ignore else ""
@@ -189,6 +195,7 @@ class _World:
             found = f"{ENUMERATED}, {len(nodes):,} beliefs about {size:,} hidden states{without}"
         aliased = self.beliefs.num_aliased()
         found += f"; {aliased:,} observations stand for several of them" if aliased else ""
+        found += "; what it truncates, other than by a step limit, is an end" if self._cuts_end else ""
         readers = sorted(self.search.clock_readers)
         return f"{found}; the clock is read ({', '.join(readers[:3])})" if readers else found
 
@@ -214,28 +221,6 @@ def _renumbered(outcomes: Outcomes, numbers: NDArray[Any], size: int) -> Outcome
         success = np.zeros((size, actions, count), dtype=np.bool_)
         success[numbers[order]] = outcomes.success[order]
     return Outcomes(**tables, start=start, success=success)
-
-
-def _own_limit(search: Search) -> int | None:
-    """The time at which the environment itself truncates all episodes, if any."""
-    steps = ((each.depth + 1, step) for each in search.states for row in each.steps for step in row)
-    truncated: dict[bool, set[int]] = {True: set(), False: set()}  # times of steps that are no end
-    for when, step in steps:
-        if not step.terminated:
-            truncated[step.truncated].add(when)
-    if not truncated[True]:
-        return search.limit_met
-    limit = min(truncated[True])
-    is_timed = all(
-        search.states[step.following].depth == state.depth + 1
-        for state in search.states
-        for row in state.steps
-        for step in row
-        if step.following >= 0
-    )
-    if not is_timed or max(truncated[False], default=0) >= limit:  # a state must have one time
-        raise search.refusal(NO_LIMIT)
-    return limit
 
 
 def _action_names(search: Search) -> list[str] | None:

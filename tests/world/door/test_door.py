@@ -149,6 +149,40 @@ class SeededInInit(Line):
         return super().step(1 if self.np_random.random() < (0.75 if action else 0.5) else 0)
 
 
+class SeededInReset(SeededInInit):
+    """A new generator in each reset, with the seed if one is given."""
+
+    def __init__(self) -> None:
+        pass
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.np_random, _ = seeding.np_random(seed)
+        return super().reset(seed=None)
+
+
+class OfNumpyInReset(SeededInReset):
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.np_random = np.random.default_rng(seed)
+        return Line.reset(self, seed=None)
+
+
+class Views(Line):
+    """What is written into one array is read from another that shows the same memory."""
+
+    def __init__(self) -> None:
+        self.memory = np.zeros((2, 3))
+        self.writing, self.reading = self.memory[1], self.memory.T[2]
+
+    def step(self, action: int) -> Result:
+        self.writing[2], before = action, self.reading[1]
+        shown, reward, over, cut, info = super().step(action)
+        return shown, reward - 0.25 * float(before), over, cut, info
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.memory[:] = 0
+        return super().reset(seed=seed)
+
+
 class SampleOfSpace(Line):
     def step(self, action: int) -> Result:
         return super().step(self.action_space.sample() if self.np_random.integers(10) == 0 else action)
@@ -225,6 +259,9 @@ TRUTH: dict[str, tuple[Callable[[], Any], float]] = {
     "rooms by identity": (Rooms, GAMMA**2),
     "many rooms by identity": (lambda: Rooms(40), GAMMA**38),
     "a generator made in __init__": (SeededInInit, coin()),
+    "a generator made in reset": (SeededInReset, coin()),
+    "a generator of numpy's made in reset": (OfNumpyInReset, coin()),
+    "views of one array": (Views, GAMMA**2 - 0.25 * (GAMMA + GAMMA**2)),
     "a sample of its actions": (SampleOfSpace, slipping(0.05)),
     "the tutorial": (lambda: Target(3), of_target(3)),
 }
@@ -451,14 +488,6 @@ def test_a_table_is_a_shortcut_only_where_it_is_all_of_the_state() -> None:
     assert Evaluator(fuel, 0.95, 100).optimal_value == pytest.approx(0.95**5)
 
 
-class Cut(Line):
-    """Truncates in a place, not at a time."""
-
-    def step(self, action: int) -> Result:
-        self.at = 0 if self.at == 2 and action else self.at + 1
-        return self.at, float(self.at == 0), False, self.at == 3, {}
-
-
 class Twins(Line):
     """Shows two equal numbers, which are one object or two; what is paid depends on which."""
 
@@ -507,6 +536,16 @@ class OldStep(Line):
         return observation, reward, over, info
 
 
+class Painted(Line):
+    """What it shows is drawn when it is made."""
+
+    def __init__(self) -> None:
+        self.paint = np.random.RandomState().permutation(4)
+
+    def shown(self) -> Any:
+        return int(self.paint[self.at])
+
+
 class Endless(Line):
     def step(self, action: int) -> Result:
         self.count = getattr(self, "count", 0) + 1
@@ -525,7 +564,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
         r"step\(\) returns .* as in the old Gym: .* \(observation, reward, termin",
     ),
     "a count without end": (Endless, "count"),
-    "a cut that is not at a time": (Cut, "truncates some episodes earlier than others"),
+    "colours that are drawn when it is made": (Painted, "is another world each time it is made"),
     "a recording that is read": (lambda: Sparse(Monitor(Line())), r"reads info\['episode'\] of a recording"),
     "no environment": (lambda: 3, "int is not an environment; must be a gymnasium.Env"),
     "a failing constructor": (lambda: 1 / 0, r"cannot make an environment \(ZeroDivisionError"),

@@ -173,6 +173,72 @@ class OnTheStack(Paying):
         return heads
 
 
+class Apart(Paying):
+    """Two different numbers, each drawn until it is new, in a `for` loop."""
+
+    def draw(self) -> Any:
+        taken: set[int] = set()
+        for _ in range(2):
+            while True:
+                number = int(self.np_random.integers(3))
+                if number not in taken:
+                    taken.add(number)
+                    break
+        return sum(taken)
+
+
+class OneByOne(Paying):
+    """The same, by a method that the loop calls."""
+
+    def draw(self) -> Any:
+        self.taken: list[int] = []
+        for number in range(2):
+            self.add(number)
+        self.taken, total = [], sum(self.taken)
+        return total
+
+    def add(self, number: int) -> None:
+        while len(self.taken) == number:
+            drawn = int(self.np_random.integers(3))
+            if drawn not in self.taken:
+                self.taken.append(drawn)
+
+
+class OverAList(Paying):
+    """Nobody sees how far the iterator of a list is."""
+
+    def draw(self) -> Any:
+        for _ in [0, 0]:
+            while self.np_random.random() < 0.5:
+                pass
+        return 1
+
+
+class OverADraw(Paying):
+    """How long the loop is was drawn, and is nowhere to be seen."""
+
+    def draw(self) -> Any:
+        count = 0
+        for _ in range(int(self.np_random.integers(1, 4))):
+            while self.np_random.random() < 0.5:
+                pass
+            count += 1
+        return count
+
+
+class SetAgain(Paying):
+    """The variable of the loop is set within it."""
+
+    def draw(self) -> Any:
+        total = 0.0
+        for each in range(3):
+            each = 0
+            while self.np_random.random() < 0.5:
+                pass
+            total += each
+        return total
+
+
 COUNTS = {0: "1/2", 1: "1/4", 2: "1/8", 3: "1/8"}
 SHARES: dict[type[Paying], dict[float, str]] = {
     Until: dict.fromkeys(range(1, 6), "1/5"),
@@ -188,6 +254,8 @@ SHARES: dict[type[Paying], dict[float, str]] = {
     Helped: {0: "1/3", 1: "1/3", 3: "1/3"},
     Restored: COUNTS,
     OfAHelper: COUNTS,
+    Apart: dict.fromkeys((1, 2, 3), "1/3"),
+    OneByOne: dict.fromkeys((1, 2, 3), "1/3"),
 }
 
 
@@ -206,6 +274,12 @@ def test_shares_are_exact(kind: type[Paying]) -> None:
     assert shares == pytest.approx(
         {paid: float(Fraction(text)) for paid, text in SHARES[kind].items()}, abs=1e-15
     )
+
+
+@pytest.mark.parametrize("kind", [OverAList, OverADraw, SetAgain])
+def test_a_loop_whose_iterator_is_not_seen_is_no_rejection(kind: type[Paying]) -> None:
+    with pytest.raises(InputError, match="one step may draw more than 500 times"):
+        found(kind)
 
 
 @pytest.mark.parametrize("kind", [OfTheClass, OnTheStack])

@@ -456,10 +456,6 @@ UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
         {"move": lambda s, a: (s.np_random.bit_generator.state["has_uint32"], 0.0, False)},
         "bit_generator is used",
     ),
-    "another generator in reset": (
-        {"begin": lambda s: int(np.random.default_rng().integers(2)), "move": lambda s, a: (0, 0.0, False)},
-        "does not repeat a walk",
-    ),
     "a global generator in reset": (
         {"begin": lambda s: int(np.random.rand() < 0.5), "move": lambda s, a: (0, 0.0, False)},
         "another generator than",
@@ -474,10 +470,6 @@ UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
             "move": lambda s, a: (0, 0.0, False),
         },
         "makes another np_random",
-    ),
-    "an early end by chance": (
-        {"step": lambda s, a: (0, 0.0, False, bool(s.np_random.random() < 0.5), {})},
-        "truncates some episodes earlier",
     ),
     "a class attribute that takes turns": (
         {"move": _guess(lambda s: _in_turn(_Held))},
@@ -499,13 +491,6 @@ UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
             "move": lambda s, a: (0, float(a == s.layout), False),
         },
         "is another world each time it is made",
-    ),
-    "a view of an array": (
-        {
-            "begin": lambda s: s.__dict__.update(grid=(grid := np.zeros(4)), row=grid[1:]) or 0,
-            "move": lambda s, a: (int(s.np_random.integers(2)), 0.0, False),
-        },
-        "two arrays share memory",
     ),
     "no reward": (
         {"move": lambda s, a: (0, [1.0, np.nan][s.np_random.integers(2)], False)},
