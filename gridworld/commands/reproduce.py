@@ -43,7 +43,9 @@ def main(arguments: Sequence[str]) -> None:
     members = population(then)
     if options.keep is not None:
         check_inside(options.keep, "--keep")
-        check_free(options.keep, "--keep")
+        kept = find_run(options.keep)  # begun before the run had ended, it is the run itself or a copy
+        is_later = kept is not None and str(kept.manifest.get("started")) > str(then.manifest.get("ended"))
+        check_free(options.keep, "--keep", is_later)
     print(printable(f"{options.run}: {config.agent.name} on {config.env.name}, seed {config.seed}"))
     for line in _circumstances(then):
         print(f"  {printable(line)}", flush=True)
@@ -57,7 +59,8 @@ def main(arguments: Sequence[str]) -> None:
         tempfile.TemporaryDirectory(prefix="gridworld-") as temporary,
         claimed(folder := options.keep or Path(temporary) / "again"),
     ):
-        before = find_run(folder)
+        if (before := find_run(folder)) and before.is_finished:
+            print(printable(f"  continues the run in {folder}, which had finished"))
         again = config if options.keep is not None else without_pictures(config)
         try:
             repeat(then, folder, again, mdp, options.trust, members)

@@ -159,10 +159,10 @@ def is_started(folder: Path) -> bool:
 
 def check_is_folder(path: Path, of: str) -> None:
     """Check that there is a folder; it is to be that `of` something."""
-    if not path.is_dir():
+    if not os.path.isdir(path):  # whatever its length
         key, _, value = str(path).partition("=")
-        wanted = f"leave out {key}=" if value and Path(value).is_dir() else f"give the folder of {of}"
-        raise InputError(f"{path}: {'is a file' if path.exists() else 'no such folder'}; {wanted}")
+        wanted = f"leave out {key}=" if value and os.path.isdir(value) else f"give the folder of {of}"
+        raise InputError(f"{path}: {'is a file' if os.path.exists(path) else 'no such folder'}; {wanted}")
 
 
 def check_is(folder: Path, file: str = MANIFEST) -> None:
@@ -176,13 +176,13 @@ def check_is(folder: Path, file: str = MANIFEST) -> None:
         raise InputError(f"{folder}: {what}" + (f"; give a {kind}'s, e.g. {found[0]}" if found else ""))
 
 
-def check_free(folder: Path, key: str = "hydra.run.dir") -> None:
+def check_free(folder: Path, key: str = "hydra.run.dir", may_be_finished: bool = False) -> None:
     """Refuse a folder that cannot be written, or holds a finished run, a sweep or other runs.
 
     An unfinished run in it is accepted here: whether it is the same one is checked with the settings.
     """
     try:
-        is_finished = read_run(folder).is_finished
+        is_finished = read_run(folder).is_finished and not may_be_finished
     except InputError:  # there is none, or its manifest is damaged
         is_finished = False
     if is_finished:

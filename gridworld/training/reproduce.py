@@ -125,8 +125,8 @@ def repeat(
 ) -> None:
     """Train a run again in `folder`, which exists, with the members of its `population` elsewhere.
 
-    An unfinished run of the same settings in it is continued. `trust` imports the classes that its settings
-    name, wherever they are from. It is an `InputError` if it cannot be trained here.
+    A run of the same settings in it is continued as far as it lacks something. `trust` imports the classes
+    that its settings name, wherever they are from. It is an `InputError` if it cannot be trained here.
     """
     first, *longer = lengths(then, config)
     overrides = then.manifest.get("overrides") or []
@@ -134,7 +134,7 @@ def repeat(
     config = dataclasses.replace(config, total_timesteps=first, logging=logging)
     own = training(config, folder, overrides, lambda env: mdp, is_trusted=False)
     if begun := find_run(folder):
-        if members:
+        if members and not begun.is_finished:
             raise InputError(
                 f"{folder}: contains an unfinished run, whose numbers depend on other runs, so it cannot be "
                 "continued; choose another folder"
@@ -143,7 +143,9 @@ def repeat(
         if reached in longer:
             first, longer = reached, longer[longer.index(reached) + 1 :]
         same = dataclasses.replace(config, total_timesteps=first)
-        unfinished_of(folder, same, lambda env: mdp, trust).resume()
+        unfinished = unfinished_of(folder, same, lambda env: mdp, trust)
+        if not begun.is_finished:
+            unfinished.resume()
     elif not members:
         run_alone(own)
     else:

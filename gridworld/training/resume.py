@@ -52,10 +52,8 @@ def open_unfinished(folder: Path, trust: bool = False) -> Unfinished:
 def unfinished_of(
     folder: Path, config: TrainConfig, world: World = compiled, trust: bool = True
 ) -> Unfinished:
-    """Read the unfinished run of these settings, to resume it with them; refused if its own differ."""
+    """Read the run of these settings in a folder, to resume it with them; refused if its own differ."""
     unfinished = open_unfinished(folder, trust)  # its classes are those of `config`, or it is refused
-    if unfinished.run.is_finished:
-        raise InputError(f"{folder}: contains a run already; choose another folder")
     own, given = (
         dict(flat(settings(each) | {"total_timesteps": each.total_timesteps}))
         for each in (unfinished.config, config)
@@ -65,6 +63,8 @@ def unfinished_of(
     if check_settings(config, world).text() != unfinished.mdp.text() and not differing:
         differing = [f"the world {config.env.name} has changed"]
     if differing:
+        if unfinished.run.is_finished:
+            raise InputError(f"{folder}: contains a run already; choose another folder")
         more = f" and {len(differing) - _NAMED} more" if len(differing) > _NAMED else ""
         raise InputError(
             f"{folder}: contains an unfinished run with other settings "

@@ -155,8 +155,6 @@ def test_what_differs_in_the_environment_is_told_and_the_run_is_kept_where_it_is
     names = [{path.name for path in run.iterdir() if "tfevents" not in path.name} for run in (kept, copy)]
     assert names[0] == names[1] | {".lock"}
     assert (kept / "policy.png").read_bytes() == (copy / "policy.png").read_bytes()
-    with pytest.raises(InputError, match="contains a run already"):
-        reproduce(copy, capsys, "--keep", str(kept))
     with pytest.raises(InputError, match=r"--keep=\.\./x: leads out of the current folder"):
         reproduce(copy, capsys, "--keep", "../x")
 
@@ -193,10 +191,35 @@ def test_a_reproduction_that_is_killed_is_continued_by_the_same_command(
         assert content["status"] == "running"
         lengths.append(content["config"]["total_timesteps"])
     assert sorted(set(lengths)) == [1000, 1600]
-    with pytest.raises(InputError, match="kept: contains a run already"):
-        main([str(folder), "--keep", str(kept)])
     found = {finding.part: finding.same for finding in compare(*map(read_run, (folder, kept)), *of(folder))}
     assert found == dict.fromkeys(PARTS, True)
+
+
+def test_a_reproduction_that_is_killed_once_it_has_finished_is_compared_by_the_same_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed between two lengths, and while it is compared."""
+    folder, kept = tmp_path / "run", tmp_path / "kept"
+    train_in(folder, *SHORT["q_learning"], *PLAIN, "total_timesteps=1000")
+    go_on(folder, 1600)
+    for place, length in (("training.reproduce.open_unfinished", 1000), ("commands.reproduce.compare", 1600)):
+
+        def killed(place: str = place) -> None:
+            monkeypatch.setattr(f"gridworld.{place}", lambda *_: kill())
+            main([str(folder), "--keep", str(kept)])
+
+        assert in_a_process(killed) == -signal.SIGKILL
+        content = json.loads((kept / "manifest.json").read_text())
+        assert (content["status"], content["config"]["total_timesteps"]) == ("finished", length)
+    shown = reproduce(folder, capsys, "--keep", str(kept))
+    assert f"  continues the run in {kept}, which had finished\n" in shown
+    assert set(verdicts(shown).values()) == {"identical", "the same"}
+    for other in (folder, shutil.copytree(folder, tmp_path / "copied")):
+        with pytest.raises(InputError, match="contains a run already"):
+            main([str(folder), "--keep", str(other)])
+    manifest(kept, lambda content: content["config"].update(seed=4))
+    with pytest.raises(InputError, match="kept: contains a run already"):
+        reproduce(folder, capsys, "--keep", str(kept))
 
 
 def of(folder: Path) -> tuple[TrainConfig, Mdp]:
