@@ -252,6 +252,22 @@ def test_a_launcher_of_ours_is_used_wherever_it_is_set(
         assert told == f"error: hydra/launcher=slurm{where}: {module} is not used here; {known}"
 
 
+def test_a_yaml_of_ones_own_may_choose_a_launcher_of_ours(
+    tmp_path: Path, refusal: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = tmp_path / "conf" / "hydra" / "launcher" / "mine.yaml"
+    own.parent.mkdir(parents=True)
+    words = f"train.py -m agent=q_learning seed=0,1 total_timesteps=0 --config-dir {tmp_path / 'conf'}"
+    for target, more, told in (
+        ("gridworld.sweeps.launchers.forks", "n_jobs: 0", "hydra.launcher.n_jobs=0: must be the number"),
+        ("gridworld.sweeps.launchers.joblib", "foo: 1", "foo: no such key"),
+        ("hydra._internal.core_plugins.basic_launcher.BasicLauncher", "", "total_timesteps=0: must be"),
+    ):
+        monkeypatch.delenv(FULL_ERROR, raising=False)
+        own.write_text(f"_target_: {target}\n{more}\n")
+        assert refusal(f"{words} hydra/launcher=mine").startswith(f"error: {told}")
+
+
 def test_slurm_is_started_where_it_is(
     tmp_path: Path, refusal: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,7 @@ from gridworld.base.console import repeating
 from gridworld.base.errors import InputError, install_command
 from gridworld.base.processes import LostError, Processes, can_fork, worker_count
 from gridworld.config.compose import refuse_unused
+from gridworld.config.sweep import LAUNCHER_SCHEMAS
 from gridworld.config.train import check_bounds
 from gridworld.sweeps.folder import STOP
 from gridworld.sweeps.job import StopSweep, Worker
@@ -45,10 +46,13 @@ class Launch:
 def launcher_settings(config: DictConfig) -> tuple[str, dict[str, Any]]:
     """The launcher that is chosen, and its settings. Raises `InputError` where it cannot work."""
     refuse_unused(config.hydra)
-    settings: Any = OmegaConf.to_object(config.hydra.launcher)
-    check_bounds(settings, "hydra.launcher.")
-    own = dataclasses.asdict(settings)
-    kind = str(own.pop("_target_")).rpartition(".")[2]
+    own: Any = OmegaConf.to_container(config.hydra.launcher, resolve=True)
+    kind = own["_target_"].rpartition(".")[2]
+    if kind in LAUNCHER_SCHEMAS:  # which a yaml of one's own need not name
+        settings: Any = OmegaConf.to_object(OmegaConf.merge(LAUNCHER_SCHEMAS[kind], own))
+        check_bounds(settings, "hydra.launcher.")
+        own = dataclasses.asdict(settings)
+    del own["_target_"]
     choice = f"hydra/launcher={config.hydra.runtime.choices['hydra/launcher']}"
     if own.get("n_jobs") == 0:
         raise InputError("hydra.launcher.n_jobs=0: must be the number of workers, or -1 for one on each core")
