@@ -150,6 +150,7 @@ class Mdp:
 
         Reference: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, section 5.3.
         """
+        Bounds(0, 1).check("share", share)
         start = (1 - share) * self.start + share * self.acting / self.acting.sum()
         return dataclasses.replace(self, start=frozen(start))
 

@@ -85,6 +85,12 @@ def test_the_env_the_batch_and_the_evaluation_start_alike(share):
     assert (np.abs(counts - 4000 * mdp.start)[drawn] <= 5 * spread[drawn] + 1).all()
 
 
+@pytest.mark.parametrize("share", [-1, 2, float("nan"), "x"])
+def test_a_share_of_exploring_starts_is_a_probability(share):
+    with pytest.raises(InputError, match=f"^share={share}: must be .*from 0 to 1$"):
+        GridWorldEnv().mdp.with_exploring_starts(share)
+
+
 @pytest.mark.parametrize("make", [GridWorldEnv, GridWorldVectorEnv])
 def test_an_env_takes_a_compiled_world_alone(make):
     mdp = compile_mdp(load("four_rooms"), slip=0.3, step_reward=-0.1)
