@@ -32,7 +32,7 @@ from gridworld.diagnosis import verdict
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.envs.rendering import Frame
 from gridworld.run import summary as run_summary
-from gridworld.run.folder import claimed
+from gridworld.run.folder import check_inside, claimed
 from gridworld.run.reader import check_free, is_started, read_columns
 from gridworld.training.resume import unfinished_of
 from gridworld.training.saved_run import SavedRun, read_visits
@@ -191,7 +191,8 @@ def train(
     with _ONE_AT_A_TIME, _torch_threads_kept(), _as_python_interrupts(folder is not None):
         if folder is None:
             return _train_without_files(config, given, world)
-        path = Path(folder).expanduser()
+        path = as_path("train: folder", folder)
+        check_inside(path.absolute(), "folder")
         check_free(path, "folder")
         try:
             with claimed(path.absolute()):

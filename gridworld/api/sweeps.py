@@ -121,7 +121,7 @@ def sweep(
         SweepResult('runs/two', 6 jobs: 6 done)
     """
     new = f"runs/{datetime.now():%Y-%m-%d_%H-%M-%S}_sweep_{secrets.token_hex(3)}"
-    path = Path(folder or new).expanduser()
+    path = as_path("sweep: folder", folder or new)
     words = [*command_words(overrides, settings, of_many=True), _word("hydra.sweep.dir", path)]
     _run_command("train", ["-m", *words], progress)
     return SweepResult(path)
@@ -154,7 +154,7 @@ def tune(
         InputError: a mistake in the settings or the folder; no trial came to a score; no Optuna.
         KeyboardInterrupt: Ctrl-C.
     """
-    path = Path(folder).expanduser()
+    path = as_path("tune: folder", folder)
     words = [*command_words(overrides, settings, of_many=True), _word("tune.folder", path)]
     _run_command("tune", words, progress)
     return find_tunings([path])[0][0]
@@ -177,7 +177,7 @@ def record(
     folder = run.folder if isinstance(run, RunResult) else as_path("record: run", run)
     if folder is None:
         raise InputError("run: has no folder, so that its files are gone; train it with folder=...")
-    place = Path(out or folder / "recording").expanduser()
+    place = as_path("record: out", out or folder / "recording")
     words = [str(folder), "--out", str(place.absolute()), "--format", *(format or ("png", "gif"))]
     for name, value in options.items():
         words += [f"--{name.replace('_', '-')}", str(value)][

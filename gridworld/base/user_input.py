@@ -94,7 +94,8 @@ def _shown(size: float) -> str:
 
 def as_path(name: str, value: Any) -> Path:
     """An argument that is a path, as one; refuses anything else."""
-    if not isinstance(value, str | PathLike) or not isinstance(os.fspath(value), str):
+    text = os.fspath(value) if isinstance(value, str | PathLike) else None
+    if not isinstance(text, str) or "\0" in text:
         raise InputError(f"{name}={str(value)[:50]}: must be a path, a str or a Path")
     return Path(value).expanduser()
 

@@ -108,7 +108,10 @@ def shell_path(folder: Path) -> str:
 
 
 def check_inside(path: Path, key: str) -> None:
-    """Refuse a relative path that leads out of the current folder; `key` is the option that has it."""
+    """Refuse the root, and a relative path that leads out of the current folder; `key` is its option."""
+    if os.path.realpath(path) == os.sep:
+        where = f"{key}={path}: is the root of the file system"
+        raise InputError(f"{where}; name a folder in it, e.g. /home/me/run")
     normal = os.path.normpath(path)
     if os.path.isabs(normal) or normal.split(os.sep)[0] not in (os.curdir, os.pardir):
         return
@@ -148,8 +151,6 @@ def claimed(folder: Path, begun: str = MANIFEST, alone: bool = True) -> Iterator
     Where others may work in it too, it is not `alone`. An `OSError` of the block names the folder, if it
     names nothing.
     """
-    if folder.resolve() == folder.resolve().parent:
-        raise InputError(f"{folder}: is the root of the file system; name a folder in it, e.g. /home/me/run")
     is_first = not folder.parent.exists()
     make_folder(folder.parent)
     folder.mkdir(exist_ok=True)

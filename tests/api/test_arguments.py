@@ -58,10 +58,20 @@ def test_amounts_are_refused_before_they_are_made(tmp_path: Path) -> None:
             gridworld.load_world(tmp_path / "world.npz")
 
 
-def test_the_root_is_no_folder_of_a_run() -> None:
-    with pytest.raises(InputError, match=r"^/: is the root of the file system"):
-        gridworld.train("agent=q_learning", "total_timesteps=64", folder="/")
-    assert not os.path.exists("/manifest.json")
+@pytest.mark.parametrize("name", OWN_WORDS)
+def test_a_folder_that_is_no_path_or_the_root_is_refused(name: str) -> None:
+    call, before = getattr(gridworld, name), os.listdir("/")
+    for folder in (5, ["x"], b"x", "a\0b"):
+        with pytest.raises(InputError, match=f"^{name}: folder=.*: must be a path, a str or a Path$"):
+            call("agent=q_learning", "total_timesteps=64", folder=folder)
+    with pytest.raises(InputError, match=r"^folder=/: is the root of the file system"):
+        call("agent=q_learning", "total_timesteps=64", folder="/")
+    assert os.listdir("/") == before
+
+
+def test_a_path_that_is_too_long_is_no_folder() -> None:
+    with pytest.raises(InputError, match="no such folder; give the folder of a run"):
+        gridworld.open_run("x" * 5000)
 
 
 def test_too_little_memory_is_said() -> None:
