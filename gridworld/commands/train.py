@@ -32,15 +32,10 @@ from gridworld.base.errors import EXIT_CODE, InputError
 from gridworld.base.user_input import called_from, limited
 from gridworld.commands.manual import manual
 from gridworld.config.compose import VERSION_BASE, completed, refuse_unused, register_schemas, to_config
-from gridworld.config.messages import sentence, unreadable_file
+from gridworld.config.messages import sentence
 from gridworld.config.recipes import Chosen
 from gridworld.config.train import TrainConfig
-from gridworld.config.words import (
-    conf_folder,
-    is_override,
-    own_conf_folders,
-    refuse_unclear,
-)
+from gridworld.config.words import conf_folder, own_conf_folders, refuse_unclear
 from gridworld.config.worlds import each_once
 from gridworld.run.folder import MANIFEST, SWEEP_JSON, alone_in, check_inside, claimed, shell_path
 from gridworld.run.reader import check_free, check_is, is_started
@@ -71,7 +66,8 @@ def _call_hydra() -> None:
     os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors instead of printing them
     try:
         with _at_end:
-            _prepare_command_line()
+            refuse_unclear(sys.argv[1:])
+            sys.argv[1:] = completed(sys.argv[1:], _world)
             hydra.main(version_base=VERSION_BASE, config_path=str(conf_folder()), config_name="train")(
                 run_job
             )()
@@ -84,26 +80,24 @@ def _call_hydra() -> None:
         if not mistake:
             raise
         if isinstance(error, UnicodeDecodeError | RecursionError):
-            folders = [conf_folder(), *own_conf_folders(sys.argv[1:])]
-            raise InputError(unreadable_file(error, folders)) from None
+            raise InputError(_unreadable(sys.argv[1:])) from None
         raise InputError(sentence(error)) from None
     except KeyboardInterrupt:
         print("interrupted before training began", file=sys.stderr)
         raise
 
 
-def _prepare_command_line() -> None:
-    """Write `sys.argv` as Hydra takes it: with the words of a result and a recipe, and plain numbers."""
-    refuse_unclear(sys.argv[1:])
-    if any(word.startswith("recipe=") for word in sys.argv[1:]):
-        from gridworld.config.recipe_file import with_recipe
-
-        sys.argv[1:] = with_recipe(sys.argv[1:])
-    words = completed(sys.argv[1:], _world)
-    places = [at for at, _ in enumerate(words) if is_override(words, at)]
-    if places and places[-1] - places[0] >= len(places):  # Hydra takes settings in one piece
-        words = [*(words[at] for at in places), *(each for at, each in enumerate(words) if at not in places)]
-    sys.argv[1:] = words
+def _unreadable(words: Sequence[str]) -> str:
+    """A sentence on the yaml file that raises an error for which Hydra names no file."""
+    what = "is not UTF-8 text, or it contains itself"
+    for file in (file for folder in own_conf_folders(words) for file in sorted(folder.rglob("*.yaml"))):
+        try:
+            OmegaConf.load(file)
+        except (UnicodeDecodeError, RecursionError):
+            return f"{file}: {what}"
+        except Exception:
+            continue  # which would name its file itself
+    return f"a yaml file {what}"
 
 
 @contextlib.contextmanager

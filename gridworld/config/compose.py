@@ -28,7 +28,7 @@ from gridworld.config.recipes import Chosen, may_need_recipe, with_recipe_by_rul
 from gridworld.config.settings import agent_schemas
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SearchConfig, SweepConfig
 from gridworld.config.train import TrainConfig
-from gridworld.config.words import conf_folder, is_override, own_conf_folders, prepared
+from gridworld.config.words import conf_folder, own_conf_folders, prepared, split
 from gridworld.config.worlds import SOURCES, EnvConfig, GymnasiumConfig, MapConfig, World, compiled, is_id
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
@@ -52,12 +52,12 @@ def compose(words: Sequence[str], world: World = compiled) -> TrainConfig:
     It may have `--config-dir` and `recipe=`. It may be called in any thread, and in a program that uses Hydra
     itself. `world` compiles the world, by which a recipe is chosen.
     """
-    own = list(own_conf_folders(words))
-    values = with_recipe([word for at, word in enumerate(words) if is_override(words, at)])
+    options, rest = split(words)
+    values = [*search_path(list(own_conf_folders(options))), *with_recipe(rest)]
     try:
         with _leaving_hydra_as_it_was():
             _store_schemas()
-            return compose_run([*search_path(own), *values], world=world)[0]
+            return compose_run(values, world=world)[0]
     except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
         raise InputError(sentence(error)) from None
 
@@ -96,22 +96,20 @@ def compose_whole(name: str, words: Sequence[str]) -> DictConfig:
 
 def compose_run(
     words: Sequence[str], but: Collection[str] | None = (), world: World = compiled
-) -> tuple[TrainConfig, DictConfig, list[str]]:
-    """Compose a run's settings with the recipe that fits; Hydra's own part; the words that choose it.
+) -> tuple[TrainConfig, Chosen, list[str]]:
+    """Compose a run's settings with the recipe that fits; what it chooses; the word for that recipe.
 
     A launcher that is not ours is refused, or one of `but`; None: it may be any.
     """
-    hydras: list[DictConfig] = []
 
     def again(more: list[str]) -> tuple[TrainConfig, Chosen]:
         whole = compose_whole("train", [*words, *more])
         if but is not None:
             refuse_unused(whole.hydra, but)
-        hydras.append(whole.hydra)
-        return to_config(whole), Chosen.of(hydras[-1])
+        chosen = Chosen.of(whole.hydra)
+        return to_config(whole), chosen
 
-    config, added = with_recipe_by_rule(prepared(words), again, world)
-    return config, hydras[-1 if added else 0], added
+    return with_recipe_by_rule(prepared(words), again, world)
 
 
 def refuse_unused(own: DictConfig, but: Collection[str] = ()) -> None:
@@ -128,25 +126,17 @@ def refuse_unused(own: DictConfig, but: Collection[str] = ()) -> None:
 
 
 def completed(words: Sequence[str], world: World = compiled) -> list[str]:
-    """A command line as Hydra takes it, with the words that choose the recipe of a single run."""
-    own = list(own_conf_folders(words))
-    options = {word.partition("=")[0] for word in words} & _NO_SINGLE_RUN
-    found = prepared(words, of_many=bool(options & {"-m", "--multirun"}))
-    places = [number for number, _ in enumerate(found) if is_override(found, number)]
-    values = [found[number] for number in places]
-    if options or not (own or may_need_recipe(values)):
-        return found
-    added: list[str] = []
-    try:
-        _, whole, added = compose_run([*search_path(own), *values], None, world)
-        agent = whole.runtime.choices.agent
-        found = [word.replace("tuned=${agent}", f"tuned={agent}") for word in found]
-    except InputError:
-        raise
-    except Exception:
-        pass  # Hydra composes again, and says what is wrong
-    end = places[-1] + 1 if places else len(found)  # options may follow
-    return [*found[:end], *added, *found[end:]]
+    """A command line as Hydra takes it, options first, with the word that chooses a single run's recipe."""
+    options, rest = split(words)
+    named = {option.partition("=")[0] for option in options}
+    rest = prepared(with_recipe(rest), of_many=bool(named & {"-m", "--multirun"}))
+    own = list(own_conf_folders(options))
+    if named & _NO_SINGLE_RUN or not (own or may_need_recipe(rest)):
+        return [*options, *rest]
+    with contextlib.suppress(OmegaConfBaseException):  # an interpolation may need what only Hydra's job knows
+        _, chosen, added = compose_run([*search_path(own), *rest], None, world)
+        rest = [*(word.replace("tuned=${agent}", f"tuned={chosen.agent}") for word in rest), *added]
+    return [*options, *rest]
 
 
 def search_path(folders: Sequence[Path]) -> list[str]:

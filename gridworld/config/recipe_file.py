@@ -23,14 +23,14 @@ from gridworld.base.errors import InputError
 from gridworld.base.safe_read import as_text, read_bytes
 from gridworld.base.user_input import users_folder
 from gridworld.config.fields import MISSING, Text
+from gridworld.config.recipes import CHOSEN
 from gridworld.config.settings import check_foreign, foreign, is_file, settings_of_a_run
 from gridworld.config.train import TrainConfig
-from gridworld.config.words import is_override
+from gridworld.config.words import split
 
 KEY = "recipe"
 TRUST = "trust"
 IN_A_STUDY = ("experiment", "winner.yaml")
-CHOSEN = ("agent", "env", "observation", "tuned")
 _EARLIER = "preset"  # in studies of earlier versions; `prepared` reads it
 _LARGEST = 2**16  # bytes
 _DEEPEST = 20  # levels
@@ -58,9 +58,8 @@ def with_recipe(words: Sequence[str]) -> list[str]:
     truths = [word for word in rest if word.startswith(f"{TRUST}=")]
     if not set(truths) <= {f"{TRUST}=true", f"{TRUST}=false"}:
         raise InputError(f"{truths[0]}: must be true or false")
-    rest = [word for word in rest if word not in truths]
-    at = next((i for i, _ in enumerate(rest) if is_override(rest, i)), len(rest))
-    return [*rest[:at], *overrides(_file(given[0]), f"{TRUST}=true" in truths), *rest[at:]]
+    options, rest = split([word for word in rest if word not in truths])
+    return [*options, *overrides(_file(given[0]), f"{TRUST}=true" in truths), *rest]
 
 
 def _file(word: str) -> Path:

@@ -37,6 +37,7 @@ from gridworld.config.worlds import EnvConfig, World, compiled
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
     from gridworld.world.mdp import Mdp
 
+CHOSEN = ("agent", "env", "observation", "tuned")  # groups of files, by their names
 GROUP, NONE = "tuned", "none"
 STOCHASTIC, LARGE = CLASSES
 _DEFAULT_WORLD, _DEFAULT_STATES = "classic", 30
@@ -56,15 +57,16 @@ class Chosen:
 
     agent: str
     env: str
+    observation: str
     tuned: str
     folders: tuple[Path, ...]  # of yaml files
 
     @classmethod
     def of(cls, hydra: Any) -> Chosen:
         """Read Hydra's own part of a composition."""
-        agent, env, tuned = (str(hydra.runtime.choices.get(group)) for group in ("agent", "env", GROUP))
+        names = (str(hydra.runtime.choices.get(group)) for group in CHOSEN)
         places = (Path(each.path) for each in hydra.runtime.config_sources if each.schema == "file")
-        return cls(agent, env, tuned, tuple(places))
+        return cls(*names, folders=tuple(places))
 
     @property
     def recipe(self) -> str | None:
@@ -124,10 +126,10 @@ def with_recipe_by_rule(
     words: Sequence[str],
     compose: Callable[[list[str]], tuple[TrainConfig, Chosen]],
     world: World = compiled,
-) -> tuple[TrainConfig, list[str]]:
+) -> tuple[TrainConfig, Chosen, list[str]]:
     """Compose a command line, and once more where the rule says another recipe than Hydra brought in.
 
-    `compose` takes words besides `words`. Returns the settings, and the words that were added.
+    `compose` takes words besides `words`. Returns the settings, what is chosen, and the words added.
     """
     config, chosen = compose([])
     chosen.check()
@@ -139,8 +141,8 @@ def with_recipe_by_rule(
             again, others = compose([word])
             sizes = {} if name is None else _sizes(others, name)
             if all(getattr(again, key) == number for key, number in sizes.items()):
-                return others.settle(again, words), [word]
-    return chosen.settle(config, words), []
+                return others.settle(again, words), others, [word]
+    return chosen.settle(config, words), chosen, []
 
 
 def _in_order(

@@ -17,6 +17,9 @@ from gridworld.config.worlds import is_id
 CLASSES = ("stochastic", "large")  # of worlds, for which agents have recipes
 OF_THE_COMMAND = ("experiment", "recipe", "resume", "trust", "anyway")  # words that look like settings
 _FLOAT = re.compile(r"(?<![\w.$'\"])[-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.'\"])")
+_BLANKS = re.compile(  # words, with \0 between them, that are one: agent = dqn; seed=0, 1
+    r"(?<![^\0])(?:[^\0=]+(?:\0=\0?|=\0)|[^\0]*,\0(?:[^\0=]*,\0)*)[^\0=]+(?![^\0])"
+)
 _PACKAGE = Path(__file__).parents[1]
 _WITH_VALUE = (  # Hydra's options that the next word belongs to
     *("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--package", "-p"),
@@ -38,60 +41,58 @@ def own_conf_folders(words: Sequence[str]) -> Iterator[Path]:
             yield Path(value or following)
 
 
-def is_override(words: Sequence[str], index: int) -> bool:
-    """Whether a word of a command line is neither an option of Hydra's nor an option's value."""
-    return not words[index].startswith("-") and (index == 0 or words[index - 1] not in _WITH_VALUE)
+def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The options of Hydra's in a command line, each with its value, and its settings and choices."""
+    options, rest = list[str](), list[str]()
+    for before, word in itertools.pairwise(["", *words]):
+        (options if word.startswith("-") or before in _WITH_VALUE else rest).append(word)
+    return options, rest
 
 
 def prepared(words: Sequence[str], of_many: bool = False) -> list[str]:
-    """A command line as Hydra takes it: 1e5 as 100000, experiment=ENV_AGENT as the choice of the two.
+    """Settings and choices as Hydra takes them: 1e5 as 100000, experiment=ENV_AGENT as the choice of the two.
 
-    An environment by its id, or by the name of its class, is the choice env=gymnasium with that id. A recipe
-    may be named as in earlier versions, tuned=ENV_AGENT or preset=CLASS; a class alone is that of the agent.
-    In the words `of_many` runs, a recipe stays as it is named, until these are known.
+    An environment by its id, or by the name of its class, is the choice env=gymnasium with that id. In the
+    words `of_many` runs, a recipe stays as it is named, until these are known.
     """
-    found: list[str] = []
+    found = [] if of_many else _recipe(words)
     chosen = {word.lstrip("+").partition("=")[0] for word in words if "=" in word}
     for word in words:
         key, _, value = word.partition("=")
+        name = key.lstrip("+")
         if key[:1] == "~" and key[1:] in settings_of_a_run():
             raise InputError(f"{word}: a setting cannot be taken away; give it a value, {key[1:]}=...")
         if key == "env" and all(map(is_id, value.split(","))):
             found += ["env=gymnasium", f"env.id={value}"]
-        elif of_many and key in ("tuned", "preset"):
-            found.append(word)
-        elif key == "tuned":
-            if not (value == "none" and {f"preset={name}" for name in CLASSES} & set(words)):
-                found.append(f"tuned={_recipe(value)}")
-        elif key == "preset":
-            found += _of_preset(word, value, [each for each in words if each.startswith("tuned=")])
-        elif key.lstrip("+") == "experiment" and value in pairs():
+        elif name == "experiment" and value in pairs():
             pair = zip(("env", "agent"), pairs()[value], strict=True)
-            found += [f"{group}={name}" for group, name in pair if group not in chosen]
-        elif takes_whole_numbers(key.lstrip("+")) and re.search(r"[.eE]", value):
+            found += [f"{group}={choice}" for group, choice in pair if group not in chosen]
+        elif takes_whole_numbers(name) and re.search(r"[.eE]", value):
             found.append(f"{key}={_FLOAT.sub(lambda number: digits(number.group()), value)}")
-        else:
+        elif of_many or key not in ("tuned", "preset"):
             found.append(word)
     return found
 
 
-def _recipe(name: str) -> str:
-    """A recipe's name from one that may be of an earlier version, or of a class alone."""
+def _recipe(words: Sequence[str]) -> list[str]:
+    """The word for the recipe that is named in a command line, maybe by a class alone.
+
+    In earlier versions it was tuned=ENV_AGENT and, for a class of worlds, preset=CLASS.
+    """
+    given = dict(word.split("=", 1) for word in words if word.startswith(("tuned=", "preset=")))
+    name, preset = given.get("tuned"), given.get("preset", "auto")
+    if preset in CLASSES and name in (None, "none"):
+        name = preset
+    elif preset != "auto" and (preset != "none" or name is None):
+        raise InputError(
+            f"preset={preset}: a preset is a recipe now; write tuned=none for the agent's own settings, or "
+            f"tuned=NAME for its recipe for a class of worlds, {' or '.join(CLASSES)}"
+        )
     if name in CLASSES:
-        return f"${{agent}}/{name}"
-    return "/".join(reversed(pairs()[name])) if name in pairs() else name
-
-
-def _of_preset(word: str, value: str, tuned: list[str]) -> list[str]:
-    """The words for a preset, which earlier versions had beside a recipe."""
-    if value in CLASSES and not set(tuned) - {"tuned=none"}:
-        return [f"tuned={_recipe(value)}"]
-    if value == "auto" or (value == "none" and tuned):
-        return []
-    raise InputError(
-        f"{word}: a preset is a recipe now; write tuned=none for the agent's own settings, or tuned=NAME for "
-        f"its recipe for a class of worlds, {' or '.join(CLASSES)}"
-    )
+        name = f"${{agent}}/{name}"
+    elif name in pairs():
+        name = "/".join(reversed(pairs()[name]))
+    return [] if name is None else [f"tuned={name}"]
 
 
 @functools.cache
@@ -106,41 +107,39 @@ def pairs() -> dict[str, tuple[str, str]]:
 
 def refuse_unclear(words: Sequence[str]) -> None:
     """Refuse slips of the hand: settings as options, in quotation marks, with blanks, without a key."""
-    known = {*OF_THE_COMMAND, *settings_of_a_run()}
-    groups = {file.name for file in conf_folder().iterdir() if file.is_dir()}
-    for word, following in itertools.pairwise([*words, ""]):
-        option, equals, value = word.partition("=")
-        name = option.lstrip("-").replace("-", "_")
-        if name != option and (name in known or any(each.startswith(f"{name}.") for each in known)):
-            takes_next = not equals and following and not following.startswith("-") and "=" not in following
-            given = f"{word} {following}" if takes_next else word
-            value = (following if takes_next else value) or "VALUE"
-            raise InputError(f"{given}: a setting is written without dashes; write {name}={value}")
-        if option == "config-dir":
-            raise InputError(f"{word}: is an option; write --{word}")
-    for folder in own_conf_folders(words):
+    options, rest = split(words)
+    _refuse_options(words)
+    groups = sorted(file.name for file in conf_folder().iterdir() if file.is_dir())
+    for folder in own_conf_folders(options):
         if folder.name in groups and not any((folder / group).is_dir() for group in groups):
             raise InputError(
                 f"--config-dir={folder}: give the folder above it, which has a folder {folder.name}"
             )
-    for index, word in enumerate(words):
-        if not is_override(words, index):
-            continue
+    if found := _BLANKS.search("\0".join(rest)):
+        word = found[0].replace("\0", "")
+        many = "-m " if "," in word and "[" not in word and "-m" not in options else ""
+        raise InputError(f"{' '.join(found[0].split(chr(0)))}: has blanks; write {many}{word}")
+    for word in rest:
         if word[:1] in ("'", '"'):
             raise InputError(f"{word}: is in quotation marks, which the shell passed on; leave them out")
-        rest = list(itertools.takewhile(lambda each: not each.startswith("-"), words[index:]))
-        if rest[1:2] == ["="] or (word[-1:] == "=" and rest[1:] and "=" not in rest[1]):
-            count = 3 if rest[1] == "=" else 2
-            raise InputError(f"{' '.join(rest[:count])}: has blanks; write {''.join(rest[:count])}")
-        if word.endswith(",") and rest[1:]:
-            values = [word, *itertools.takewhile(lambda each: "=" not in each, rest[1:])]
-            ends = next((n for n, each in enumerate(values, 1) if not each.endswith(",")), len(values))
-            line = "".join(values[:ends]).rstrip(",")
-            line = line if "-m" in words else f"-m {line}"
-            raise InputError(f"{' '.join(values[:ends])}: has blanks after commas; write {line}")
         if "=" not in word and not word.startswith("~"):
-            files = [conf_folder() / group / f"{word}.yaml" for group in sorted(groups)]
-            found = [f"{file.parent.name}={word}" for file in files if file.is_file() and word]
-            wanted = "a setting is written key=value, as in agent=dqn"
-            wanted = f"write {[*found, '--help'][0]}" if found or word == "help" else wanted
-            raise InputError(f"{word or 'an empty word'}: is not a setting; {wanted}")
+            files = [conf_folder() / group / f"{word}.yaml" for group in groups]
+            choices = [f"write {file.parent.name}={word}" for file in files if word and file.is_file()]
+            choices += (
+                ["write --help"] if word == "help" else ["a setting is written key=value, as in agent=dqn"]
+            )
+            raise InputError(f"{word or 'an empty word'}: is not a setting; {choices[0]}")
+
+
+def _refuse_options(words: Sequence[str]) -> None:
+    """Refuse a setting that is written as an option, and an option as a setting."""
+    known = {*OF_THE_COMMAND, *settings_of_a_run()}
+    known |= {name.rpartition(".")[0] for name in known}
+    for word, following in itertools.pairwise([*words, ""]):
+        option, _, value = word.partition("=")
+        name = option.lstrip("-").replace("-", "_")
+        if name != option and name in known:
+            value = value or ("" if following[:1] == "-" or "=" in following else following) or "VALUE"
+            raise InputError(f"{option}: a setting is written without dashes; write {name}={value}")
+        if option == "config-dir":
+            raise InputError(f"{word}: is an option; write --{word}")

@@ -234,7 +234,7 @@ def plan(
         def compose(words: list[str], given: list[str] = given) -> tuple[TrainConfig, Chosen]:
             return configure([*given, *words])
 
-        config, added = with_recipe_by_rule(prepared(given), compose, world)
+        config, _, added = with_recipe_by_rule(prepared(given), compose, world)
         said: tuple[str, ...] = ()
         mistake, layout, memory = None, "", 0
         try:

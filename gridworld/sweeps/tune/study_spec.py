@@ -47,8 +47,8 @@ from gridworld.base.processes import core_count
 from gridworld.config.compose import compose_run, compose_whole, register_schemas, search_path, slug
 from gridworld.config.fields import Effect
 from gridworld.config.messages import sentence
-from gridworld.config.recipe_file import CHOSEN, with_recipe
-from gridworld.config.recipes import Chosen
+from gridworld.config.recipe_file import with_recipe
+from gridworld.config.recipes import CHOSEN
 from gridworld.config.settings import effect_of
 from gridworld.config.sweep import DimensionConfig, TuneConfig
 from gridworld.config.train import TrainConfig, check_bounds
@@ -115,9 +115,8 @@ def compose_study(words: Sequence[str], conf: tuple[Path, ...] = ()) -> StudySpe
     register_schemas()
     try:
         of_search, of_run = _divide(with_recipe(words))
-        base, own, _ = compose_run([*of_run, *search_path(conf)], but=("ray", "slurm"))  # it runs here
-        choices = {group: str(own.runtime.choices[group]) for group in CHOSEN}
-        choices["tuned"] = Chosen.of(own).recipe or "none"
+        base, chosen, _ = compose_run([*of_run, *search_path(conf)], but=("ray", "slurm"))  # it runs here
+        choices = {group: getattr(chosen, group) for group in CHOSEN} | {"tuned": chosen.recipe or "none"}
         if not any(re.match(r"[+~]*tune(?!\.)", word) for word in of_search):
             of_search.append(f"tune={choices['agent']}")
         search = compose_whole("tune", [*of_search, *search_path(conf)])
