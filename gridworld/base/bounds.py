@@ -16,6 +16,8 @@ MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them
 LARGEST_INTEGER = 2**63  # beyond, neither arrays nor the files of a run have them
 _LARGEST_EXACT = 2.0**53  # a float beyond may stand for several whole numbers
 NEAREST_GAMMA = 1 - 1e-11  # to 1, but for 1 itself
+LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
+_POWERS = {LINEAR: 1.0, "sqrt_": 0.5, "quad_": 2.0}  # of what is left of training, by a schedule's prefix
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,32 @@ class Decay:
     def at(self, progress: float) -> float:
         """The rate after this share of training, from 0 to 1."""
         return float(self.initial * (1 - progress) ** self.power)
+
+
+def falls(value: object) -> bool:
+    """Whether a setting's value is written as a rate that falls, as `lin_NUMBER` is."""
+    return isinstance(value, str) and value.startswith(tuple(_POWERS))
+
+
+def parse_schedule(key: str, value: int | float | str, linear_only: bool = False) -> Decay:
+    """Read a rate: a number, or one of `lin_NUMBER`, `sqrt_NUMBER` and `quad_NUMBER`, which fall.
+
+    `key` is for the message; with `linear_only` the last two are refused.
+    """
+    form, digits = "", value
+    if isinstance(value, str):
+        form = next((form for form in _POWERS if value.startswith(form)), "")
+        digits = value.removeprefix(form) if form and "_" not in value.removeprefix(form) else "nan"
+    try:
+        number = float(digits)
+    except (ValueError, OverflowError):
+        number = math.nan
+    if not 0 <= number < math.inf or (linear_only and form not in ("", LINEAR)):
+        others = "" if linear_only else " (sqrt_, quad_: for one by a root or a square)"
+        raise InputError(
+            f"{key}={value}: must be a number of at least 0, or {LINEAR}NUMBER for a linear decay{others}"
+        )
+    return Decay(number, _POWERS.get(form, 0.0))
 
 
 def discount(key: str, value: float) -> None:

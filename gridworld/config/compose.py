@@ -24,7 +24,7 @@ from yaml import YAMLError
 from gridworld.base.errors import InputError
 from gridworld.config.messages import meant, sentence
 from gridworld.config.recipe_file import literal, with_recipe
-from gridworld.config.recipes import Chosen, may_need_recipe, with_recipe_by_rule
+from gridworld.config.recipes import MAY_NEED, Chosen, with_recipe_by_rule
 from gridworld.config.settings import agent_schemas
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SearchConfig, SweepConfig
 from gridworld.config.train import TrainConfig
@@ -57,7 +57,7 @@ def compose(words: Sequence[str], world: World = compiled) -> TrainConfig:
     try:
         with _leaving_hydra_as_it_was():
             _store_schemas()
-            return compose_run(values, world=world)[0]
+            return compose_run(values, world)[0]
     except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
         raise InputError(sentence(error)) from None
 
@@ -94,18 +94,11 @@ def compose_whole(name: str, words: Sequence[str]) -> DictConfig:
         return hydra.compose(name, prepared(words), return_hydra_config=True)
 
 
-def compose_run(
-    words: Sequence[str], but: Collection[str] | None = (), world: World = compiled
-) -> tuple[TrainConfig, Chosen, list[str]]:
-    """Compose a run's settings with the recipe that fits; what it chooses; the word for that recipe.
-
-    A launcher that is not ours is refused, or one of `but`; None: it may be any.
-    """
+def compose_run(words: Sequence[str], world: World = compiled) -> tuple[TrainConfig, Chosen, list[str]]:
+    """Compose a run's settings with the recipe that fits; what it chooses; the word for that recipe."""
 
     def again(more: list[str]) -> tuple[TrainConfig, Chosen]:
         whole = compose_whole("train", [*words, *more])
-        if but is not None:
-            refuse_unused(whole.hydra, but)
         chosen = Chosen.of(whole.hydra)
         return to_config(whole), chosen
 
@@ -131,10 +124,10 @@ def completed(words: Sequence[str], world: World = compiled) -> list[str]:
     named = {option.partition("=")[0] for option in options}
     rest = prepared(with_recipe(rest), of_many=bool(named & {"-m", "--multirun"}))
     own = list(own_conf_folders(options))
-    if named & _NO_SINGLE_RUN or not (own or may_need_recipe(rest)):
+    if named & _NO_SINGLE_RUN or not (own or any(map(MAY_NEED.match, rest))):
         return [*options, *rest]
     with contextlib.suppress(OmegaConfBaseException):  # an interpolation may need what only Hydra's job knows
-        _, chosen, added = compose_run([*search_path(own), *rest], None, world)
+        _, chosen, added = compose_run([*search_path(own), *rest], world)
         rest = [*(word.replace("tuned=${agent}", f"tuned={chosen.agent}") for word in rest), *added]
     return [*options, *rest]
 

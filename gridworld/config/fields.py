@@ -14,13 +14,10 @@ from dataclasses import field, fields, is_dataclass
 from enum import Enum, IntEnum, auto
 from typing import Annotated, Any
 
-from gridworld.base.bounds import Bounds, Decay
-from gridworld.base.errors import InputError
+from gridworld.base.bounds import Bounds
 
 MISSING = "???"  # OmegaConf's sign for a value that has to be given
 MOST_KEPT = 10**9  # episodes that a mean is taken over
-LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
-_POWERS = {LINEAR: 1.0, "sqrt_": 0.5, "quad_": 2.0}  # of what is left of training, by a schedule's prefix
 EFFECTS, PRIVILEGE, BOUNDS, RATE = "effects", "privilege", "bounds", "rate"  # keys of a field's metadata
 
 LIBRARIES = (  # of classes that an agent is made of
@@ -128,29 +125,3 @@ Rewards = Annotated[dict[str, float], Text.WORD]
 Kwargs = Annotated[dict[str, Any], Text.KWARGS]
 Schedule = int | float | Word
 WholeNumbers = Annotated[Any, Text.WORD, "a whole number, or lists and dicts of them"]
-
-
-def falls(value: object) -> bool:
-    """Whether a setting's value is written as a rate that falls, as `lin_NUMBER` is."""
-    return isinstance(value, str) and value.startswith(tuple(_POWERS))
-
-
-def parse_schedule(key: str, value: Schedule, linear_only: bool = False) -> Decay:
-    """Read a rate: a number, or one of `lin_NUMBER`, `sqrt_NUMBER` and `quad_NUMBER`, which fall.
-
-    `key` is for the message; with `linear_only` the last two are refused.
-    """
-    form, digits = "", value
-    if isinstance(value, str):
-        form = next((form for form in _POWERS if value.startswith(form)), "")
-        digits = value.removeprefix(form) if form and "_" not in value.removeprefix(form) else "nan"
-    try:
-        number = float(digits)
-    except (ValueError, OverflowError):
-        number = math.nan
-    if not 0 <= number < math.inf or (linear_only and form not in ("", LINEAR)):
-        others = "" if linear_only else " (sqrt_, quad_: for one by a root or a square)"
-        raise InputError(
-            f"{key}={value}: must be a number of at least 0, or {LINEAR}NUMBER for a linear decay{others}"
-        )
-    return Decay(number, _POWERS.get(form, 0.0))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import re
+from typing import Any
 
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
@@ -45,7 +46,10 @@ _SENTENCES = (  # a pattern of what is said: what is said instead, or after a se
     ("Ambiguous value", "; to run one job for each of the values, add -m"),
     ("Could not append to config", "; leave out the plus"),
     ("Could not override 'preset'", "; a preset is a recipe now: leave this line out"),
-    (r"'\d+\.0' of type 'float' .* Integer", "; in YAML, write whole numbers without a point or exponent"),
+    (
+        r"'\d+\.0' of type 'float' could not be converted to Integer",
+        "; in YAML, write whole numbers without a decimal point or exponent",
+    ),
     (r"Value '\d+(\.\.|-)\d+'", "; a range, for -m, is range(1,6)"),
     ("of type 'str' could not be converted to Integer", "; must be a whole number, such as 30000 or 3e4"),
     ("'[^']*%' of type 'str' could not be converted to Float", "; must be a number, such as 0.1 for 10 %"),
@@ -131,7 +135,10 @@ def _unknown_key(error: ConfigKeyError | ConfigAttributeError, in_a_file: bool) 
     if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
         return f"{place}: no such key; a new entry of a dictionary needs a plus: +{place}=..."
     of = f" of {kind.__name__.removesuffix('Config')}" if issubclass(kind, AgentConfig) else ""
-    fact, own = f"{place}: no such setting{of}", sorted({each.name for each in dataclasses.fields(kind)} - {key})
+    fact, own = (
+        f"{place}: no such setting{of}",
+        sorted({each.name for each in dataclasses.fields(kind)} - {key}),
+    )
     if in_a_file and key in (each.name for each in dataclasses.fields(TrainConfig)):
         return f"{fact}; the file's first line must be  # @package _global_"
     if in_a_file and kind.__name__ == "TuneConfig":
@@ -147,7 +154,8 @@ def _unknown_key(error: ConfigKeyError | ConfigAttributeError, in_a_file: bool) 
     section = place.partition(".")[0]
     known = [name for name in all_settings() if not name.startswith(f"{section}.")]
     if kind is TrainConfig:
-        known = [name for name, _ in flat(OmegaConf.to_container(error.parent_node))]
+        composed: Any = OmegaConf.to_container(error.parent_node)
+        known = [name for name, _ in flat(composed)]
     last = {name: name.rpartition(".")[2] for name in (*known, *OF_THE_COMMAND) if name != key}
     alike = _similar(key, sorted(set(last.values())), n=1, cutoff=0.8)
     return fact + (

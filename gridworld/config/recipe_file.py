@@ -7,8 +7,6 @@ settings that the schema has. What comes out are plain overrides, quoted.
 
 from __future__ import annotations
 
-import dataclasses
-import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -21,11 +19,9 @@ from omegaconf import OmegaConf
 from gridworld.base.bounds import LARGEST_INTEGER
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import as_text, read_bytes
-from gridworld.base.user_input import users_folder
 from gridworld.config.fields import MISSING, Text
 from gridworld.config.recipes import CHOSEN
-from gridworld.config.settings import check_foreign, foreign, is_file, settings_of_a_run
-from gridworld.config.train import TrainConfig
+from gridworld.config.settings import check_foreign, settings_of_a_run
 from gridworld.config.words import split
 
 KEY = "recipe"
@@ -35,8 +31,6 @@ _EARLIER = "preset"  # in studies of earlier versions; `prepared` reads it
 _LARGEST = 2**16  # bytes
 _DEEPEST = 20  # levels
 _CHOICE = re.compile(Text.CHOICE.value[0])
-# an override
-_WORD = re.compile(r"(?:(~)|(\+{0,2}))(\w+(?:\.\w+)*)(?(1)(?:=.*)?|=(.*))", re.ASCII | re.DOTALL)
 # text as it is
 _BARE = re.compile(
     r"(?!(?:true|false|null|nan|inf)$)([a-z_]|/|\.\.?/)[\w./:-]*( [\w./:-]+)*", re.ASCII | re.IGNORECASE
@@ -64,17 +58,16 @@ def with_recipe(words: Sequence[str]) -> list[str]:
 
 def _file(word: str) -> Path:
     given = word.partition("=")[2].strip("'\"")
-    if not given:
-        raise InputError(f"{word}: must be a recipe's yaml, or the folder of a study")
-    path = Path(given)
-    if not path.exists():
-        raise InputError(f"{word}: no such file; must be a recipe's yaml, or the folder of a study")
+    path, study = Path(given), Path(given, IN_A_STUDY[0])
+    if not given or not path.exists():
+        missing = "no such file; " if given else ""
+        raise InputError(f"{word}: {missing}must be a recipe's yaml, or the folder of a study")
     if not path.is_dir():
         return path
-    if not os.path.lexists(path / IN_A_STUDY[0]):
+    if study.is_symlink():
+        raise InputError(f"{study}: is a symbolic link, which is not followed out of a study")
+    if not study.exists():
         raise InputError(f"{word}: is not the folder of a study, it has no {'/'.join(IN_A_STUDY)}")
-    if (path / IN_A_STUDY[0]).is_symlink():
-        raise InputError(f"{path / IN_A_STUDY[0]}: is a symbolic link, which is not followed out of a study")
     return path.joinpath(*IN_A_STUDY)
 
 
@@ -149,58 +142,6 @@ def _values(content: dict[Any, Any], path: Path, section: str = "") -> Iterator[
             yield from _values(value, path, f"{name}.")
         else:
             raise InputError(f"{path}: {name}={str(value)[:80]}: must be settings")
-
-
-def words_again(
-    words: Sequence[str], config: TrainConfig, called_from: Path | None = None, trust: bool = False
-) -> Iterator[str]:
-    """What a command line changed, to be typed again here; the paths in it are relative to `called_from`.
-
-    Of a stranger's, these are choices, and settings with the values that `config` has. What is not a setting,
-    or would run code or read a file elsewhere, is left out unless there is `trust`.
-    """
-    settings, changed = dataclasses.asdict(config), set[str]()
-    for word in words:
-        found = _WORD.fullmatch(word)
-        if found is None:
-            yield from [word] if trust else []
-            continue
-        removed, sign, key, value = found.groups("")
-        given: Any = settings
-        for name in key.split("."):
-            given = given.get(name, MISSING) if isinstance(given, dict) else MISSING
-        place = path_from_here(given, called_from) if _is_own_file(key, given) else given
-        changed.add(key)
-        if trust and place == given:
-            yield word
-        elif key == KEY:
-            continue
-        elif removed:
-            yield f"~{key}"
-        elif key in (*CHOSEN, IN_A_STUDY[0]):
-            if _CHOICE.fullmatch(value):
-                yield f"{key}={value}"
-        elif place != MISSING and (trust or not any(foreign({key: place}))):
-            yield f"{sign}{key}={literal(place, key)}"
-    for name, given in settings["env"].items() if trust else ():
-        key, place = f"env.{name}", path_from_here(given, called_from)  # of a yaml file
-        if _is_own_file(key, given) and key not in changed and place != given:
-            yield f"{key}={literal(place, key)}"
-
-
-def _is_own_file(key: str, value: Any) -> bool:
-    """Whether the value of a setting is a file's path, and not the name of a shipped map."""
-    from gridworld.world.layout import shipped_layouts  # here, with numpy
-
-    return is_file(key) and value not in shipped_layouts()
-
-
-def path_from_here(path: Any, called_from: Path | None) -> Any:
-    """The path of a file or folder that was typed in another folder, as it is typed here, if it is there."""
-    if called_from is None or not isinstance(path, str) or not os.path.exists(called_from / path):
-        return path
-    here, found = os.path.realpath(users_folder()), Path(os.path.normpath(called_from / path))
-    return str(found.relative_to(here) if found.is_relative_to(here) else found)
 
 
 def literal(value: Any, where: str) -> str:

@@ -45,7 +45,7 @@ _ENGINE = "tabulated"  # the only one for which the numbers of a class are made
 _SIZE = ("total_timesteps", "n_envs")
 _GIVEN = re.compile(rf"[+~]*{GROUP}\b")
 _SIZED = re.compile(rf"[+~]*({'|'.join(_SIZE)})\b")
-_OF_A_WORLD = re.compile(rf"[+~]*(env|experiment|hydra|{GROUP})\b")
+MAY_NEED = re.compile(rf"[+~]*(env|experiment|hydra|{GROUP})\b")  # words that may lead to a recipe
 _OTHER_WORLD = re.compile(r"[+~]*(env\.(?!max_episode_steps\b)|env=\{|experiment\b)")
 _WITH = " with "  # AGENT with ANOTHER/WORLD
 _MEASURED = frozenset({Effect.LEARNING, Effect.LENGTH, Effect.TASK})  # on what a measurement depends
@@ -60,13 +60,14 @@ class Chosen:
     observation: str
     tuned: str
     folders: tuple[Path, ...]  # of yaml files
+    hydra: Any  # Hydra's own part of the composition
 
     @classmethod
     def of(cls, hydra: Any) -> Chosen:
         """Read Hydra's own part of a composition."""
-        names = (str(hydra.runtime.choices.get(group)) for group in CHOSEN)
+        agent, env, observation, tuned = (str(hydra.runtime.choices.get(group)) for group in CHOSEN)
         places = (Path(each.path) for each in hydra.runtime.config_sources if each.schema == "file")
-        return cls(*names, folders=tuple(places))
+        return cls(agent, env, observation, tuned, tuple(places), hydra)
 
     @property
     def recipe(self) -> str | None:
@@ -115,11 +116,6 @@ def agent_and_recipe(config: TrainConfig) -> tuple[str, str | None]:
     text = config.recipe or ""
     agent, other, name = text.partition(_WITH)
     return (agent, name) if other else (text.partition("/")[0], text if "/" in text else None)
-
-
-def may_need_recipe(words: Sequence[str]) -> bool:
-    """Whether a command line may choose another world than the default one, or a recipe."""
-    return any(map(_OF_A_WORLD.match, words))
 
 
 def with_recipe_by_rule(

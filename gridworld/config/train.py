@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gridworld.base.bounds import LARGEST_INTEGER, MOST_ENVS, discount
+from gridworld.base.bounds import LARGEST_INTEGER, MOST_ENVS, discount, parse_schedule
 from gridworld.base.errors import InputError
 from gridworld.config.fields import (
     BOUNDS,
@@ -29,7 +29,6 @@ from gridworld.config.fields import (
     affects,
     bounds,
     declared,
-    parse_schedule,
     privilege,
     setting,
 )

@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent
+from gridworld.base.bounds import LINEAR, falls, parse_schedule
 from gridworld.base.errors import InputError
-from gridworld.config.fields import LINEAR, falls, parse_schedule
 from gridworld.config.train import TrainConfig
 from gridworld.run.reader import read_columns
 from gridworld.training.saved_run import SavedRun, read_visits

@@ -16,11 +16,12 @@ from functools import partial
 from pathlib import Path
 
 from gridworld.base.atomic_write import holds
+from gridworld.base.bounds import falls
 from gridworld.base.console import printable, tell, telling_if_slow
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import open_ordinary
 from gridworld.base.serialization import State, StateError
-from gridworld.config.fields import Use, falls
+from gridworld.config.fields import Use
 from gridworld.config.settings import flat, foreign
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig, World, compiled

@@ -12,17 +12,21 @@ import dataclasses
 import io
 import math
 import os
+import re
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent
 from gridworld.base.errors import InputError
-from gridworld.base.user_input import DAMAGED, limited
-from gridworld.config.fields import Use
-from gridworld.config.settings import check_foreign, read_config
+from gridworld.base.user_input import DAMAGED, limited, users_folder
+from gridworld.config.fields import MISSING, Text, Use
+from gridworld.config.recipes import CHOSEN
+from gridworld.config.settings import check_foreign, foreign, is_file, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.words import own_conf_folders
 from gridworld.config.worlds import MapConfig
@@ -31,11 +35,12 @@ from gridworld.run.reader import RunReader, open_run, stored_world
 from gridworld.training.setup import make_context
 from gridworld.world.evaluation import Evaluator, PolicySnapshot
 from gridworld.world.grid import GridMdp
-from gridworld.world.layout import CLASSIC, load
+from gridworld.world.layout import CLASSIC, load, shipped_layouts
 from gridworld.world.mdp import FloatArray, Mdp
 
 _LARGEST_HEADER = 2**12  # bytes before the numbers in NumPy's format
 _LONGEST_NAME = 1000  # characters; a map's name may be a path
+_OVERRIDE = re.compile(r"(?:(~)|(\+{0,2}))(\w+(?:\.\w+)*)(?(1)(?:=.*)?|=(.*))", re.ASCII | re.DOTALL)
 _UNDECODED = frozenset(map(chr, range(0xDC80, 0xDD00)))  # bytes of a path that the locale cannot decode
 
 
@@ -72,9 +77,6 @@ class SavedRun:
     @cached_property
     def _words(self) -> tuple[list[str], bool]:
         """The `overrides`, and whether any are left out."""
-        # here, with Hydra, which takes its time
-        from gridworld.config.recipe_file import path_from_here, words_again
-
         manifest, trust = self.run.manifest, self._trust
         place = manifest.get("called_from")
         called_from = None if place is None else Path(os.path.realpath(self.run.folder), place)
@@ -167,3 +169,46 @@ def read_visits(run: RunReader, shape: tuple[int, ...]) -> NDArray[np.int64]:
 def choose_policy(snapshot: PolicySnapshot, kind: str) -> FloatArray:
     """The probabilities (S, A) of a snapshot's policy of a `kind`, "greedy" or "sampled"."""
     return snapshot.greedy_policy() if kind == "greedy" else snapshot.sampled
+
+
+def words_again(
+    words: Sequence[str], config: TrainConfig, called_from: Path | None = None, trust: bool = False
+) -> Iterator[str]:
+    """What a command line changed, to be typed again here; the paths in it are relative to `called_from`.
+
+    Of a stranger's, these are choices, and settings with the values that `config` has. What is not a setting,
+    or would run code or read a file elsewhere, is left out unless there is `trust`.
+    """
+    from gridworld.config.recipe_file import literal  # here, with Hydra, which takes its time
+
+    settings, moved, given = dataclasses.asdict(config), dict[str, str](), set[str]()
+    for name, value in settings["env"].items():
+        place = path_from_here(value, called_from)
+        if is_file(f"env.{name}") and place != value and value not in shipped_layouts():
+            moved[f"env.{name}"] = settings["env"][name] = place
+    for word in words:
+        found = _OVERRIDE.fullmatch(word)
+        removed, sign, key, choice = found.groups("") if found else ("", "", "", "")
+        given.add(key)
+        value = settings
+        for name in key.split("."):
+            value = value.get(name, MISSING) if isinstance(value, dict) else MISSING
+        if trust and key not in moved:
+            yield word
+        elif removed:
+            yield f"~{key}"
+        elif key in (*CHOSEN, "experiment"):
+            if re.fullmatch(Text.CHOICE.value[0], choice):
+                yield f"{key}={choice}"
+        elif value != MISSING and key != "recipe" and (trust or not any(foreign({key: value}))):
+            yield f"{sign}{key}={literal(value, key)}"
+    if trust:
+        yield from (f"{key}={literal(place, key)}" for key, place in moved.items() if key not in given)
+
+
+def path_from_here(path: Any, called_from: Path | None) -> Any:
+    """The path of a file or folder that was typed in another folder, as it is typed here, if it is there."""
+    if called_from is None or not isinstance(path, str) or not os.path.exists(called_from / path):
+        return path
+    here, found = os.path.realpath(users_folder()), Path(os.path.normpath(called_from / path))
+    return str(found.relative_to(here) if found.is_relative_to(here) else found)

@@ -15,11 +15,12 @@ from helpers.support import CONF, configure, script
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import read_object
 from gridworld.config.compose import compose_run, register_schemas, search_path
-from gridworld.config.recipe_file import overrides, with_recipe, words_again
+from gridworld.config.recipe_file import overrides, with_recipe
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import BuiltConfig
 from gridworld.sweeps.tune.study import write_recipe
 from gridworld.sweeps.tune.study_spec import compose_study
+from gridworld.training.saved_run import words_again
 
 WINNERS = {
     "dqn": [

@@ -23,10 +23,10 @@ from gridworld.agents import TrainingContext
 from gridworld.agents.sb3.policy_outputs import CHUNK, why_unreadable
 from gridworld.agents.sb3.settings import FALLING, SCHEDULES, SB3ClassConfig, SB3Config
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
+from gridworld.base.bounds import falls, parse_schedule
 from gridworld.base.errors import InputError, in_short
 from gridworld.base.user_input import check_memory, imported, is_limited
 from gridworld.base.workarounds import generator_of, keep_compiler_out
-from gridworld.config.fields import falls, parse_schedule
 from gridworld.world.mdp import leaves_of
 
 Arguments = dict[str, Any]

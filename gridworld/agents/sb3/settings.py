@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, Optional
 
-from gridworld.base.bounds import MOST_STEPS, Bounds, Decay
+from gridworld.base.bounds import MOST_STEPS, Bounds, Decay, falls, parse_schedule
 from gridworld.base.errors import InputError
 from gridworld.config.fields import (
     BOUNDS,
@@ -21,8 +21,6 @@ from gridworld.config.fields import (
     affects,
     bounds,
     declared,
-    falls,
-    parse_schedule,
     rate,
 )
 from gridworld.config.train import AgentConfig, TrainConfig

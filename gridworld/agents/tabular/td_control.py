@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, Hook, SafePoint, TrainingContext, misfit
-from gridworld.base.bounds import Bounds
+from gridworld.base.bounds import Bounds, parse_schedule
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import read_bytes
 from gridworld.base.serialization import (
@@ -31,7 +31,7 @@ from gridworld.base.serialization import (
     set_generator_state,
 )
 from gridworld.base.user_input import npz_arrays, npz_bytes
-from gridworld.config.fields import MOST_KEPT, Effect, Schedule, Word, affects, bounds, parse_schedule, rate
+from gridworld.config.fields import MOST_KEPT, Effect, Schedule, Word, affects, bounds, rate
 from gridworld.config.train import AgentConfig, TrainConfig
 from gridworld.world.evaluation import PolicySnapshot
 from gridworld.world.mdp import LEAST_REWARD, MOST_REWARD, FloatArray, IntArray

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridworld.config.fields import LINEAR
+from gridworld.base.bounds import LINEAR
 from gridworld.diagnosis.evidence import (
     Evidence,
     Finding,

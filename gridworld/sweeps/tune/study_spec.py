@@ -44,7 +44,14 @@ from yaml import YAMLError
 from gridworld.base.console import program
 from gridworld.base.errors import InputError
 from gridworld.base.processes import core_count
-from gridworld.config.compose import compose_run, compose_whole, register_schemas, search_path, slug
+from gridworld.config.compose import (
+    compose_run,
+    compose_whole,
+    refuse_unused,
+    register_schemas,
+    search_path,
+    slug,
+)
 from gridworld.config.fields import Effect
 from gridworld.config.messages import sentence
 from gridworld.config.recipe_file import with_recipe
@@ -115,7 +122,8 @@ def compose_study(words: Sequence[str], conf: tuple[Path, ...] = ()) -> StudySpe
     register_schemas()
     try:
         of_search, of_run = _divide(with_recipe(words))
-        base, chosen, _ = compose_run([*of_run, *search_path(conf)], but=("ray", "slurm"))  # it runs here
+        base, chosen, _ = compose_run([*of_run, *search_path(conf)])
+        refuse_unused(chosen.hydra, but=("ray", "slurm"))  # it runs here
         choices = {group: getattr(chosen, group) for group in CHOSEN} | {"tuned": chosen.recipe or "none"}
         if not any(re.match(r"[+~]*tune(?!\.)", word) for word in of_search):
             of_search.append(f"tune={choices['agent']}")
