@@ -80,20 +80,20 @@ def _call_hydra() -> None:
         if not mistake:
             raise
         if isinstance(error, UnicodeDecodeError | RecursionError):
-            raise InputError(_unreadable(sys.argv[1:])) from None
+            raise InputError(_unreadable(error, sys.argv[1:])) from None
         raise InputError(sentence(error)) from None
     except KeyboardInterrupt:
         print("interrupted before training began", file=sys.stderr)
         raise
 
 
-def _unreadable(words: Sequence[str]) -> str:
-    """A sentence on the yaml file that raises an error for which Hydra names no file."""
+def _unreadable(error: Exception, words: Sequence[str]) -> str:
+    """A sentence on the yaml file that raises an error like this one, for which Hydra names no file."""
     what = "is not UTF-8 text, or it contains itself"
     for file in (file for folder in own_conf_folders(words) for file in sorted(folder.rglob("*.yaml"))):
         try:
             OmegaConf.load(file)
-        except (UnicodeDecodeError, RecursionError):
+        except type(error):
             return f"{file}: {what}"
         except Exception:
             continue  # which would name its file itself

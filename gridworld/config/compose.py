@@ -166,20 +166,19 @@ def drop_hydra(whole: DictConfig) -> DictConfig:
 
 def to_config(settings: DictConfig) -> TrainConfig:
     """Convert what Hydra composed to dataclasses; its own part is deleted."""
-    _refuse_added_keys(drop_hydra(settings))
-    return cast(TrainConfig, OmegaConf.to_object(settings))
+    config = cast(TrainConfig, OmegaConf.to_object(drop_hydra(settings)))
+    _refuse_added_keys(config)
+    return config
 
 
-def _refuse_added_keys(settings: DictConfig, prefix: str = "") -> None:
+def _refuse_added_keys(section: Any, prefix: str = "") -> None:
     """Refuse keys that `+key=value` added, which gets past the schema while Hydra composes."""
-    schema = OmegaConf.get_type(settings)
-    known = [field.name for field in dataclasses.fields(schema)] if dataclasses.is_dataclass(schema) else None
-    for key in map(str, settings):
-        if known is not None and key not in known:
-            raise InputError(f"{prefix}{key}: no such key{meant(key, sorted(known))}")
-        is_value = not (OmegaConf.is_missing(settings, key) or OmegaConf.is_interpolation(settings, key))
-        if is_value and isinstance(child := settings[key], DictConfig):
-            _refuse_added_keys(child, f"{prefix}{key}.")
+    known = [field.name for field in dataclasses.fields(section)]
+    for key, value in vars(section).items():
+        if key not in known:
+            raise InputError(f"{prefix}{key}: no such setting{meant(key, sorted(known))}")
+        if dataclasses.is_dataclass(value):
+            _refuse_added_keys(value, f"{prefix}{key}.")
 
 
 def register_schemas() -> None:

@@ -16,7 +16,6 @@ from omegaconf import OmegaConf
 from omegaconf.errors import (
     ConfigAttributeError,
     ConfigKeyError,
-    MissingMandatoryValue,
     OmegaConfBaseException,
 )
 
@@ -25,6 +24,7 @@ from gridworld.config.settings import all_settings, flat
 from gridworld.config.train import AgentConfig, TrainConfig
 from gridworld.config.words import OF_THE_COMMAND, pairs
 
+_SPACE = "; a search space is a yaml file in conf/tune, or in tune/ of --config-dir, chosen by tune=NAME"
 _SENTENCES = (  # a pattern of what is said: what is said instead, or after a semicolon, what would be right
     (
         r"Config group override must be a string.*|^argument of type '\w+' is not iterable$",
@@ -55,7 +55,7 @@ _SENTENCES = (  # a pattern of what is said: what is said instead, or after a se
     ("'[^']*%' of type 'str' could not be converted to Float", "; must be a number, such as 0.1 for 10 %"),
     ("of type 'str' could not be converted to Float", "; must be a number"),
     ("str is not a ListConfig", "; must be a list, such as [a,b]"),
-    (r"^tune\.space=", "; a search space is a yaml file in conf/tune, chosen by tune=NAME"),
+    (r"^tune\.space=", _SPACE),
 )
 _OF_SCHEMAS = {  # what to write where a schema lacks a key
     "AgentConfig": "its defaults must name a schema, as [/agent/schema/dqn@agent, _self_]",
@@ -91,8 +91,8 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, OverrideParseException):
         what = "is a comma, a bracket or a quotation mark missing or left over?"
         return f"{error.override}: is not valid syntax; {what}"
-    if isinstance(error, MissingMandatoryValue):
-        key = error.full_key or str(error).rpartition(": ")[2]
+    if missing := re.search(r"[Mm]issing mandatory value: (\S+)", str(error)):
+        key = missing[1] if "." in missing[1] else getattr(error, "full_key", None) or missing[1]
         return f"{key}: has no value; give {key}=..., or set it in a yaml file"
     lines = [line.strip().rstrip(".:") for line in str(error).splitlines()] or [type(error).__name__]
     file = re.match(r"In '([^']+)': \w+ raised while composing config$", lines[0])
@@ -133,7 +133,8 @@ def _unknown_key(error: ConfigKeyError | ConfigAttributeError, in_a_file: bool) 
     """Which key a schema lacks, and what it may be: a name like it there, or else in other sections."""
     key, place, kind = str(error.key), str(error.full_key or error.key), error.object_type
     if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
-        return f"{place}: no such key; a new entry of a dictionary needs a plus: +{place}=..."
+        plus = f"; a new entry of a dictionary needs a plus: +{place}=..."
+        return f"{place}: no such setting{_SPACE if place.startswith('tune.') else plus}"
     of = f" of {kind.__name__.removesuffix('Config')}" if issubclass(kind, AgentConfig) else ""
     fact, own = (
         f"{place}: no such setting{of}",
@@ -147,33 +148,21 @@ def _unknown_key(error: ConfigKeyError | ConfigAttributeError, in_a_file: bool) 
         return f"{fact}; {hint}"
     if key == "tune":
         return f"{fact}; that is a setting of tune.py"
-    if key in _OTHER_NAMES:
-        return fact + _or([_OTHER_NAMES[key]])
-    if near := meant(key, own):
+    if near := _or([_OTHER_NAMES[key]]) if key in _OTHER_NAMES else meant(key, own):
         return fact + near
-    section = place.partition(".")[0]
-    known = [name for name in all_settings() if not name.startswith(f"{section}.")]
+    known = {name for name in all_settings() if not name.startswith(f"{place.partition('.')[0]}.")}
     if kind is TrainConfig:
         composed: Any = OmegaConf.to_container(error.parent_node)
-        known = [name for name, _ in flat(composed)]
-    last = {name: name.rpartition(".")[2] for name in (*known, *OF_THE_COMMAND) if name != key}
-    alike = _similar(key, sorted(set(last.values())), n=1, cutoff=0.8)
-    return fact + (
-        _or(sorted(name for name in last if [last[name]] == alike)) or "; --cfg job shows all keys"
-    )
+        known = {name for name, _ in flat(composed)}
+    last = {name: name.rpartition(".")[2] for name in known.union(OF_THE_COMMAND) - {key}}
+    alike = difflib.get_close_matches(key.lower(), sorted(set(last.values())), 1, 0.8)
+    return fact + (_or(sorted(name for name in last if last[name] in alike)) or "; --cfg job shows all keys")
 
 
 def meant(key: str, known: list[str]) -> str:
-    """The names that `key` looks like, is the initials or the end of, as a question; "" if there is none."""
-    longer = [name for name in known if name.endswith(key) and len(key) > 3]
-    return _or(_similar(key, known) or longer)
-
-
-def _similar(key: str, known: list[str], n: int = 3, cutoff: float = 0.6) -> list[str]:
-    if (named := _OTHER_NAMES.get(key)) in known:
-        return [str(named)]
-    initials = [name for name in known if "_" in name and "".join(w[:1] for w in name.split("_")) == key]
-    return initials or difflib.get_close_matches(key.lower(), known, n, cutoff)
+    """The names that `key` looks like, or the one that it has elsewhere, as a question; "" for none."""
+    named = [name for name in known if name == _OTHER_NAMES.get(key)]
+    return _or(named or difflib.get_close_matches(key.lower(), known))
 
 
 def _or(names: list[str]) -> str:

@@ -115,16 +115,16 @@ def _choices(defaults: Any, path: Path) -> Iterator[str]:
     for entry in defaults if isinstance(defaults, list) else [str(defaults)]:
         if entry == "_self_":
             continue
-        named = list(entry.items()) if isinstance(entry, dict) else []
-        known = (*CHOSEN, _EARLIER)
-        groups = [group for group in known if [f"override /{group}"] == [key for key, _ in named]]
-        choice = named[0][1] if groups else None
-        if not isinstance(choice, str) or not _CHOICE.fullmatch(choice):
+        named = entry if isinstance(entry, dict) and len(entry) == 1 else {"": None}
+        ((key, choice),) = named.items()
+        group = str(key).removeprefix("override /")
+        is_known = key != group and group in (*CHOSEN, _EARLIER)
+        if not is_known or not isinstance(choice, str) or not _CHOICE.fullmatch(choice):
             raise InputError(
                 f"{path}: defaults has {str(entry)[:80]!r}; a recipe chooses {', '.join(CHOSEN)} by their "
                 "names, as in 'override /agent: dqn'"
             )
-        yield f"{groups[0]}={choice}"
+        yield f"{group}={choice}"
 
 
 def _values(content: dict[Any, Any], path: Path, section: str = "") -> Iterator[str]:

@@ -4,7 +4,7 @@ A recipe is a yaml file of settings that were tuned for an agent: `conf/tuned/AG
 `conf/tuned/AGENT/stochastic.yaml` and `large.yaml` for a class of worlds. Unless `tuned=...` is given, it is
 
 1. the agent's own for the world, or that of a world which the file in `conf/env` names in `recipes_of`; but
-   not where other settings than the file's make its actions stochastic;
+   not where other settings than the file's make a stochastic world and the agent has a recipe for these;
 2. the agent's for the world's class: `stochastic` where an action may have several outcomes, or else `large`
    where there are more states than in the default world; but not where the command line or an experiment
    gives `total_timesteps` or `n_envs`, which its numbers rest on, nor where Stable-Baselines3's own loop
@@ -148,6 +148,7 @@ def _in_order(
     names = [f"{chosen.agent}/{name}" for name in (chosen.env, *config.env.recipes_of)]
     own = next(filter(chosen.has, names), None)
     is_changed = any(map(_OTHER_WORLD.match, words)) and not is_world(config.env, chosen.env)
+    is_changed = is_changed and chosen.has(f"{chosen.agent}/{STOCHASTIC}")
     if own is not None and not (
         is_changed and (mdp := _compiled(lambda: world(config.env))) is not None and mdp.is_stochastic
     ):

@@ -16,7 +16,7 @@ import types
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from gridworld.base.console import printable
 from gridworld.base.errors import InputError
@@ -47,6 +47,7 @@ _GONE = frozenset({"preset"})  # settings of earlier versions, which say nothing
 ON_RESULT = frozenset(Effect) - {Effect.FILES, Effect.NOTHING}
 _LARGEST_KWARG = 1000  # of an environment: sizes, and what it pays
 
+T = TypeVar("T")
 Hints = tuple[Any, ...]  # types of a setting: several where the schemas of agents or worlds differ
 
 
@@ -111,13 +112,11 @@ def takes_whole_numbers(name: str) -> bool:
 
 @functools.cache
 def _whole_numbers() -> frozenset[str]:
-    return frozenset(name for name, hints in all_settings().items() if all(map(_is_whole, hints)))
+    def is_whole(hint: Any) -> bool:
+        kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+        return float not in kinds and (int in kinds or hint == WholeNumbers)
 
-
-def _is_whole(hint: Any) -> bool:
-    if get_origin(hint) in (Union, types.UnionType):
-        return int in get_args(hint) and float not in get_args(hint)
-    return hint in (int, WholeNumbers)
+    return frozenset(name for name, hints in all_settings().items() if all(map(is_whole, hints)))
 
 
 @functools.cache
@@ -139,9 +138,14 @@ def _divided() -> frozenset[str]:
 
 def effect_of(name: str) -> Effect:
     """The effect of a setting or section by its dotted name, which need not be known to the schema."""
-    while name and name not in _effects():
+    return _at(name, _effects(), Effect.LEARNING)
+
+
+def _at(name: str, declared: Mapping[str, T], otherwise: T) -> T:
+    """What is declared of a setting, or of the smallest section around it."""
+    while name and name not in declared:
         name = name.rpartition(".")[0]
-    return _effects().get(name, Effect.LEARNING)
+    return declared.get(name, otherwise)
 
 
 def with_effects(
@@ -191,7 +195,8 @@ def check_foreign(settings: Mapping[str, Any], where: str, allow: str, use: Use 
 def foreign(settings: Mapping[str, Any], use: Use = Use.COMPOSE) -> Iterator[tuple[str, Any, str]]:
     """Find what does harm if a stranger wrote it, however deep: (dotted name, value, what it does)."""
     for name, value in _leaves(settings, ""):
-        for kind in sorted(_texts_at(name), key=lambda kind: kind.name):
+        kinds = _at(name, texts(), frozenset([Text.UNKNOWN]))  # code where no schema knows
+        for kind in sorted(kinds, key=lambda kind: kind.name):
             pattern, harm, begins = kind.value
             if use < begins:
                 continue
@@ -227,30 +232,18 @@ def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
         yield name, value
 
 
-def _texts_at(name: str) -> frozenset[Text]:
-    """What a text is at this setting, or around it: code where no schema knows; nothing for a number."""
-    while name and name not in _texts():
-        name = name.rpartition(".")[0]
-    return _texts().get(name, frozenset([Text.UNKNOWN]))
-
-
-def is_file(name: str) -> bool:
-    """Whether a setting is the path of a file."""
-    return Text.FILE in _texts_at(name)
-
-
 @functools.cache
-def _texts() -> dict[str, frozenset[Text]]:
+def texts() -> dict[str, frozenset[Text]]:
+    """What the text of each setting of a run is; nothing for a number."""
     found = settings_of_a_run().items()
-    return {name: frozenset(text for hint in hints for text in texts_in(hint)) for name, hints in found}
+    return {name: frozenset(text for hint in hints for text in _texts_in(hint)) for name, hints in found}
 
 
-def texts_in(hint: Any) -> Iterator[Text]:
-    """What a type hint declares of the texts that it allows."""
+def _texts_in(hint: Any) -> Iterator[Text]:
     yield from (each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Text))
     for inner in get_args(hint):
         if not isinstance(inner, Text | str):
-            yield from texts_in(inner)
+            yield from _texts_in(inner)
 
 
 def read_config(content: Any, where: str) -> TrainConfig:

@@ -34,11 +34,10 @@ class ForksConfig:
 
 
 @dataclass
-class JoblibConfig:
+class JoblibConfig(ForksConfig):
     """`hydra/launcher=joblib`: populations in new processes on this machine, on any system."""
 
     _target_: str = "gridworld.sweeps.launchers.joblib"
-    n_jobs: int = -1
 
 
 @dataclass

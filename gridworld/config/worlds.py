@@ -123,16 +123,15 @@ class GymnasiumConfig(EnvConfig):
         from gridworld.world.sources.elsewhere import same_elsewhere
         from gridworld.world.sources.environment import compile_id
 
-        began = time.monotonic()
-        bounds = {
+        how: dict[str, Any] = {
+            "by_table": not (isinstance(self, EnumeratedConfig) or self.ignore),
             "ignore": list(self.ignore),
             "most_states": self.most_states,
             "most_seconds": self.most_seconds,
         }
-        by_table = not (isinstance(self, EnumeratedConfig) or self.ignore)
-        mdp = compile_id(self.id, self.kwargs, by_table=by_table, **bounds)
-        took = time.monotonic() - began
-        return same_elsewhere(mdp, self.id, self.kwargs, took, by_table=by_table, **bounds)
+        began = time.monotonic()
+        mdp = compile_id(self.id, self.kwargs, **how)
+        return same_elsewhere(mdp, self.id, self.kwargs, time.monotonic() - began, **how)
 
     def step_limit(self, mdp: Mdp) -> int:
         limit, own = super().step_limit(mdp), mdp.max_episode_steps
@@ -271,8 +270,7 @@ def each_once() -> World:
     worlds: dict[str, Mdp] = {}
 
     def world(env: EnvConfig) -> Mdp:
-        key = repr(env)
-        if key not in worlds:
+        if (key := repr(env)) not in worlds:
             worlds[key] = env.compile()
         return worlds[key]
 

@@ -26,7 +26,7 @@ from gridworld.base.errors import InputError
 from gridworld.base.user_input import DAMAGED, limited, users_folder
 from gridworld.config.fields import MISSING, Text, Use
 from gridworld.config.recipes import CHOSEN
-from gridworld.config.settings import check_foreign, foreign, is_file, read_config
+from gridworld.config.settings import check_foreign, foreign, read_config, texts
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.words import own_conf_folders
 from gridworld.config.worlds import MapConfig
@@ -184,7 +184,7 @@ def words_again(
     settings, moved, given = dataclasses.asdict(config), dict[str, str](), set[str]()
     for name, value in settings["env"].items():
         place = path_from_here(value, called_from)
-        if is_file(f"env.{name}") and place != value and value not in shipped_layouts():
+        if Text.FILE in texts().get(f"env.{name}", ()) and place != value and value not in shipped_layouts():
             moved[f"env.{name}"] = settings["env"][name] = place
     for word in words:
         found = _OVERRIDE.fullmatch(word)
