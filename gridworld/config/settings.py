@@ -13,7 +13,6 @@ import os
 import pkgutil
 import re
 import types
-from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -83,11 +82,11 @@ def _walk(schema: type, section: str = "") -> Iterator[tuple[str, Any, dict[str,
 
 
 def _types(schema: type, section: str = "") -> dict[str, Hints]:
-    found: dict[str, dict[Any, None]] = defaultdict(dict)
+    found: dict[str, Hints] = {}
     for name, hint, _ in _walk(schema, section):
-        if not dataclasses.is_dataclass(hint):
-            found[name][hint] = None
-    return {name: tuple(hints) for name, hints in found.items()}
+        if not (dataclasses.is_dataclass(hint) or hint in found.get(name, ())):
+            found[name] = (*found.get(name, ()), hint)
+    return found
 
 
 @functools.cache

@@ -15,7 +15,7 @@ from gridworld.config.settings import settings_of_a_run, takes_whole_numbers
 from gridworld.config.worlds import is_id
 
 CLASSES = ("stochastic", "large")  # of worlds, for which agents have recipes
-OF_THE_COMMAND = ("experiment", "recipe", "resume", "trust", "anyway")  # words that look like settings
+OF_THE_COMMAND = ("experiment", "recipe", "resume", "trust", "anyway", "tuned")  # look like settings
 _FLOAT = re.compile(r"(?<![\w.$'\"])[-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.'\"])")
 _BLANKS = re.compile(  # words, with \0 between them, that are one: agent = dqn; seed=0, 1
     r"(?<![^\0])(?:[^\0=]+(?:\0=\0?|=\0)|[^\0]*,\0(?:[^\0=]*,\0)*)[^\0=]+(?![^\0])"

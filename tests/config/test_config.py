@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -172,3 +173,9 @@ def test_options_have_dashes_and_no_word_is_empty() -> None:
     refuse_unclear(["-m", "--cfg", "job", "--config-dir=a", "--frobnicate", "--help", "agent.gamma=--seed"])
     with pytest.raises(InputError, match=r"^an empty word: is not a setting; a setting is written key=value"):
         refuse_unclear(["-m", ""])
+    for words, right in (
+        (["env.ignore=[a,", "b]"], "env.ignore=[a,b]"),
+        (["seed=0,", "1,", "2"], "-m seed=0,1,2"),
+    ):
+        with pytest.raises(InputError, match=re.escape(f"has blanks; write {right}") + "$"):
+            refuse_unclear(["agent=dqn", *words])
