@@ -16,7 +16,6 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from gridworld.base.bounds import STEP_LIMIT, Bounds, discount
-from gridworld.base.console import aligned
 from gridworld.base.errors import InputError, in_short
 from gridworld.checking.function import SingleEnv
 from gridworld.checking.sampling import Actions, Env, Replays, generators_restored, replays, sample
@@ -59,8 +58,10 @@ class ExamineResult:
         return [each.topic for each in self.findings]
 
     def __str__(self) -> str:
-        facts = aligned([[label, f" {text}"] for label, text in self.facts], ("<12", "<0"))
-        lines = [self.name, "", *facts, ""]
+        lines = [self.name, ""]
+        for label, text in self.facts:
+            lines += textwrap.wrap(f"{label:<14} {text}", _WIDTH, subsequent_indent=" " * 15)
+        lines.append("")
         for number, each in enumerate(self.findings, 1):
             found = f"{number}. {each.severity}, {each.topic}: {each.evidence}"
             for text in (found, f"   Try: {each.advice}"):
@@ -111,13 +112,13 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
         started = time.monotonic()
         found = sample(make(), Actions(first.action_space, seed), steps, seed)
         rate, replayed = len(found.before) / max(time.monotonic() - started, 1e-3), Replays()
-        mdp = _exact(make) if mdp is None else mdp
+        mdp, refusal = _exact(make) if mdp is None else (mdp, "")
         try:
             replayed = replays(make, Actions(first.action_space, seed), rate)
         except Exception as error:  # anybody's code
             found.failure = found.failure or f"a replayed episode raises {in_short(error)}"
         limit = step_limit(first) or (None if mdp is None else mdp.max_episode_steps)
-        seen = Seen(first, gamma, found, replayed, _interface(make), limit, mdp)
+        seen = Seen(first, gamma, found, replayed, _interface(make), limit, mdp, refusal)
         findings = [finding for symptom in ALL for finding in symptom(seen)]
         if mdp is not None and isinstance(env, str) and is_id(env):
             bounds = {"most_states": _MOST_STATES, "most_seconds": _SECONDS}
@@ -200,12 +201,14 @@ def _interface(make: Make) -> str:
     return ""
 
 
-def _exact(make: Make) -> Mdp | None:
-    """The tables of an environment; None where it has none and cannot be enumerated in the time for it."""
+def _exact(make: Make) -> tuple[Mdp | None, str]:
+    """The tables of an environment; or None, and why it cannot be enumerated in the time for it."""
     try:
-        return task_of(make(), most_states=_MOST_STATES, most_seconds=_SECONDS).mdp
-    except Exception:  # it cannot be enumerated, or its code fails
-        return None
+        return task_of(make(), most_states=_MOST_STATES, most_seconds=_SECONDS).mdp, ""
+    except InputError as error:
+        return None, str(error).partition(": ")[2]
+    except Exception as error:  # of anybody's code
+        return None, f"it raises {in_short(error)}"
 
 
 def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
@@ -213,33 +216,45 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
     steps, mdp, lengths = seen.steps, seen.mdp, seen.lengths
     kind = "stochastic" if seen.is_stochastic else "deterministic"
     yield "steps", f"{kind}; a seed {'repeats' if seen.replays.repeats else 'does not repeat'} an episode"
-    states = "not enumerated; what follows is of a sample"
     if mdp is not None:
-        states = f"{mdp.reachable.sum():,} can be reached; known {mdp.scope}"
-    yield "states", states
+        yield "states", f"{mdp.reachable.sum():,} can be reached; known {mdp.scope}"
+    else:
+        yield "states", f"not enumerated, so what follows is of a sample; {seen.refusal}"
     starts = len(np.unique(steps.before[steps.first]))
-    space = " ".join(str(seen.env.observation_space).split())[:60]
     met = f"{seen.observed:,} different ones in {len(steps.before):,} steps, {starts:,} at the start"
-    yield "observations", f"{met}; {space}"
+    yield "observations", f"{met}; {' '.join(str(seen.env.observation_space).split())}"
     over, cut = (int(which[steps.last].sum()) for which in (steps.terminated, steps.truncated))
     limit = f"{seen.limit:,}" if seen.limit else "not known" if cut else "none seen"
     how = f"{over:,} terminated, {cut:,} truncated; step limit {limit}"
     yield "episodes", f"{len(lengths):,} of {lengths.min():,} to {lengths.max():,} steps, {how}"
-    rewards = f"from {steps.reward.min() + 0.0:.4g} to {steps.reward.max() + 0.0:.4g}"
+    low, high, usual = (each + 0.0 for each in (steps.reward.min(), steps.reward.max(), seen.usual))
     is_usual = np.mean(steps.reward == seen.usual) >= 0.5
-    yield "rewards", f"{rewards}, mostly {seen.usual + 0.0:.4g}" if is_usual else rewards
+    mostly = f", mostly {usual:.4g}" if is_usual else ""
+    yield "rewards", f"from {low:.4g} to {high:.4g}{mostly}" if low < high else f"always {usual:.4g}"
     at_random = steps.last[steps.at_random[steps.last]]
     if seen.reach is not None:
-        soonest = "" if seen.reach[1] is None else f", which is {seen.reach[1]:,} steps away"
-        what = "the reward" if is_usual else f"a reward above {seen.usual + 0.0:.4g}"
-        yield "random policy", f"comes to {what} in {seen.reach[0]:.3%} of episodes (exact){soonest}"
-    elif is_usual and (seen.paid.any() or seen.usual <= 0) and len(at_random):
+        likely, away = seen.reach
+        how_often = "every episode" if likely == 1 else f"{_percent(likely)} of its episodes"
+        soonest = f"{away:,} step{'s' * (away > 1)} away at the soonest"
+        yield "random policy", f"comes to {seen.worth}, {soonest}, in {how_often} (exact)"
+    elif is_usual and seen.paid.any() and len(at_random):
         hits = len(np.unique(steps.episode[steps.at_random & seen.paid]))
         low, high = wilson_interval(hits, len(at_random))
-        what = "an end" if (steps.reward <= seen.usual).all() and seen.usual < 0 else "a better reward"
-        interval = f"95 % interval {low:.1%} to {high:.1%}"
-        yield "random policy", f"comes to {what} in {hits:,} of {len(at_random):,} episodes ({interval})"
+        interval = f"95 % interval {_percent(low)} to {_percent(high)}"
+        yield (
+            "random policy",
+            f"comes to {seen.worth} in {hits:,} of {len(at_random):,} episodes ({interval})",
+        )
     else:
         returns = np.bincount(steps.episode, steps.reward)[steps.episode[at_random]]
         found = f"returns {returns.mean():.4g} on average (deviation {returns.std():.3g})"
-        yield "random policy", f"{found} in {len(at_random):,} episodes"
+        yield "random policy", f"{found} in {len(at_random):,} sampled episodes"
+
+
+def _percent(share: float) -> str:
+    """A probability with one decimal, or with as many as distinguish it from 0 and from 1."""
+    for decimals in range(1, 13):
+        text = f"{share:.{decimals}%}"
+        if share in (0, 1) or text.strip("0.%") not in ("", "1"):
+            return text
+    return "less than 1e-12" if share < 0.5 else "more than 99.9999999999%"

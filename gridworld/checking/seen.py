@@ -9,11 +9,12 @@ import numpy as np
 from gymnasium import spaces
 
 from gridworld.checking.sampling import Env, Replays, Steps
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup
 
 UNLIMITED = 10_000  # steps of an episode that are counted where there is no limit
 ENDINGS = 8  # episodes, at least, that show how an environment ends them
 ERROR, WARNING = "error", "warning"
+_ROUNDING = 1e-12  # of a reward
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Seen:
     interface: str  # what Gymnasium's checker says against it
     limit: int | None  # its step limit, if it is known
     mdp: Mdp | None  # its tables, if they are known exactly
+    refusal: str = ""  # why they are not
 
     @property
     def is_stochastic(self) -> bool:
@@ -66,9 +68,21 @@ class Seen:
         return float(values[counts.argmax()]) if len(values) else 0.0
 
     @cached_property
+    def bar(self) -> float:
+        """Rewards above this are worth finding: above the usual if that is paid, else above 0 if some are."""
+        rewards = self.steps.reward
+        if self.mdp is not None:
+            rewards = self.mdp.reward[self.mdp.acting][self.mdp.probability[self.mdp.acting] > 0]
+        for bar in (max(self.usual, 0.0), 0.0):
+            better = rewards > bar + _ROUNDING
+            if better.any() and not better.all():
+                return bar
+        return self.usual
+
+    @cached_property
     def paid(self) -> BoolArray:
-        """Sampled steps worth finding: paid more than usual, or the end where all steps cost the same."""
-        better = self.steps.reward > self.usual + 1e-12
+        """Sampled steps worth finding: paid more than `bar`, or the end where all steps cost the same."""
+        better = self.steps.reward > self.bar + _ROUNDING
         return better if better.any() or self.usual >= 0 else self.steps.terminated
 
     @cached_property
@@ -97,22 +111,67 @@ class Seen:
         return bool((fixed & (np.ptp(means, axis=0) > 0)).any())
 
     @cached_property
-    def reach(self) -> tuple[float, int | None] | None:
-        """Exactly, how likely a random policy comes to what is worth finding, and in how few steps."""
+    def _worth(self) -> BoolArray:
+        """(S, A, K), the outcomes worth finding in a known world: those above `bar`, or else into a goal."""
         mdp = self.mdp
-        if mdp is None:
+        assert mdp is not None
+        possible = (mdp.probability > 0) & mdp.acting[:, None, None]
+        better = possible & (mdp.reward > self.bar + _ROUNDING)
+        if better.any() or (mdp.is_enumerated and self.usual >= 0):
+            return better
+        return possible & mdp.goal[mdp.next_state]
+
+    @cached_property
+    def returns(self) -> tuple[float, float] | None:
+        """The least and the largest discounted return of any policy within the step limit, exactly."""
+        if (mdp := self.mdp) is None:
             return None
-        worth = mdp.goal[mdp.next_state] | (mdp.reward > self.usual + 1e-12)
-        worth &= (mdp.probability > 0) & ~mdp.absorbing[:, None, None]
-        away = mdp.steps_away[worth.any(axis=(1, 2))]
+        found, least_change = [], _ROUNDING * np.abs(mdp.reward).max()
+        for chosen in (np.min, np.max):
+            v, change = np.zeros(mdp.num_states), np.inf
+            steps = iter(range(self.limit or UNLIMITED))
+            while change > least_change and next(steps, None) is not None:
+                before, v = v, chosen(backup(mdp, v, self.gamma), axis=1)
+                change = np.abs(v - before).max()
+            found.append(float(mdp.start @ v))
+        return found[0], found[1]
+
+    @property
+    def worth(self) -> str:
+        """What is worth finding, in words."""
+        paid, mdp = self.steps.reward[self.steps.reward > self.bar + _ROUNDING], self.mdp
+        if mdp is not None:
+            paid = mdp.reward[self._worth & (mdp.reward > self.bar + _ROUNDING)]
+        if len(paid):
+            is_one = np.ptp(paid) < _ROUNDING
+            return f"the reward of {paid[0]:.4g}" if is_one else f"a reward above {self.bar + 0.0:.4g}"
+        if mdp is None or not mdp.trap[mdp.reachable].any():
+            return "an end"
+        return "an end that pays best" if mdp.is_enumerated else "the goal"
+
+    @cached_property
+    def reach(self) -> tuple[float, int] | None:
+        """How likely a random policy comes to what is worth finding, and in how few steps it can be reached.
+
+        Both are exact; a probability below 1 is never rounded to 1. None: the world is not known, or nothing
+        in it is worth finding.
+        """
+        mdp = self.mdp
+        if mdp is None or not self._worth.any():
+            return None
+        worth = self._worth
         weight, origins = mdp.probability / mdp.num_actions, np.nonzero(~worth)[0]
         arriving = np.where(worth, weight, 0.0).sum(axis=(1, 2))
-        at: FloatArray = mdp.start * ~mdp.absorbing
+        at: FloatArray = mdp.start
         reached = 0.0
+        missed = float(at @ mdp.absorbing)  # what is over without it
         for _ in range(self.limit or UNLIMITED):
+            at = np.where(mdp.absorbing, 0.0, at)
             reached += float(at @ arriving)
-            following = np.bincount(mdp.next_state[~worth], at[origins] * weight[~worth], len(at))
-            at = np.asarray(following * ~mdp.absorbing, np.float64)
-            if at.sum() < 1e-12:
+            at = np.bincount(mdp.next_state[~worth], at[origins] * weight[~worth], len(at)).astype(np.float64)
+            missed += float(at @ mdp.absorbing)
+            if (at @ ~mdp.absorbing) < 1e-15:
                 break
-        return reached, int(away[away >= 0].min()) + 1 if (away >= 0).any() else None
+        missed += float(at @ ~mdp.absorbing)
+        likely = min(reached, np.nextafter(1.0, 0.0)) if missed else 1.0
+        return likely, int(mdp.steps_away[worth.any(axis=(1, 2))].min()) + 1

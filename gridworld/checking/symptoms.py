@@ -18,6 +18,7 @@ from gridworld.checking.seen import ENDINGS, ERROR, UNLIMITED, WARNING, EnvFindi
 from gridworld.world.metrics import wilson_interval
 
 _LEAST_REACHED = 1e-3  # of episodes of a random policy that come to the reward
+_ALIKE = 1e-9  # returns, relative to the largest reward
 _LEAST_LEFT = 0.05  # of the first reward under the discount
 _LARGE, _SMALL = 1e3, 1e-3  # rewards
 _LARGE_INPUT = 10.0  # root mean square of a number that is observed
@@ -139,22 +140,29 @@ def _reward(seen: Seen) -> Iterator[EnvFinding]:
     """Whether a reward can be found, and depends on what is done."""
     steps, mdp, plays, reach = seen.steps, seen.mdp, seen.replays.plays, seen.reach
     advice = "pay for progress, start closer to the goal, or check the conditions of reward and goal."
+    rewards = [[[reward for _, reward, *_ in play] for play in of_seed] for of_seed in plays]
+    are_same = bool(rewards) and all(each == of_seed[0] for of_seed in rewards for each in of_seed)
+    are_over = all(any(play[-1][2:]) for of_seed in plays for play in of_seed)
     values, has_ends = np.unique(steps.reward[np.isfinite(steps.reward)]), steps.terminated.any()
-    if mdp is not None and reach is not None and reach[1] is None:
-        values = np.unique(mdp.reward[mdp.acting][mdp.probability[mdp.acting] > 0])
-        if mdp.goal.any() or (len(values) < 2 and not mdp.terminal[mdp.reachable].any()):
-            evidence = (
-                f"no action in the {mdp.reachable.sum():,} reachable states pays more than {seen.usual:g}"
-            )
-            goal = " or reaches a goal" if mdp.goal.any() else ""
-            yield EnvFinding("reward", ERROR, f"{evidence}{goal} (exact).", advice)
+    states = "" if mdp is None else f"no action in the {mdp.reachable.sum():,} reachable states"
+    if (
+        mdp is not None
+        and seen.returns is not None
+        and np.ptp(seen.returns) <= _ALIKE * np.abs(mdp.reward).max()
+    ):
+        paid = "rewards do not depend on what is done"
+        paid = paid if len(values) > 1 else f"{states} pays more than {seen.usual + 0.0:g}"
+        evidence = f"{paid}, and every policy returns {seen.returns[0] + 0.0:.4g} (exact)."
+        yield EnvFinding("reward", ERROR, evidence, advice)
+    elif mdp is not None and reach is None and mdp.goal.any() and not mdp.is_enumerated:
+        yield EnvFinding("reward", ERROR, f"{states} reaches a goal (exact).", advice)
     elif reach is not None and reach[0] < _LEAST_REACHED:
         evidence = (
-            f"a random policy comes to the reward within {seen.limit or UNLIMITED:,} steps with probability"
+            f"a random policy comes to {seen.worth} within {seen.limit or UNLIMITED:,} steps with probability"
         )
         evidence = f"{evidence} {reach[0]:.2g} (exact); it is {reach[1]} steps away."
         yield EnvFinding("exploration", WARNING, evidence, advice)
-    elif reach is None and len(values) == 1 and not (values[0] and has_ends and len(set(seen.lengths)) > 1):
+    elif mdp is None and len(values) == 1 and not (values[0] and has_ends and len(set(seen.lengths)) > 1):
         episodes = len(np.unique(steps.episode[steps.at_random]))
         most = f"{wilson_interval(0, episodes)[1]:.1%}" if episodes else "100%"
         yield EnvFinding(
@@ -165,9 +173,7 @@ def _reward(seen: Seen) -> Iterator[EnvFinding]:
             f"in less than {most} of its episodes (95 %).",
             advice,
         )
-    rewards = [[[reward for _, reward, *_ in play] for play in of_seed] for of_seed in plays]
-    same = all(each == of_seed[0] for of_seed in rewards for each in of_seed)
-    if rewards and same and len(set(rewards[0][0][1:])) > 1:
+    elif mdp is None and are_same and (len(set(rewards[0][0][1:])) > 1 or (len(values) == 1 and are_over)):
         evidence = f"{len(rewards[0])} sequences of actions are paid the same step by step, with each of"
         evidence = f"{evidence} {len(rewards)} seeds: rewards do not depend on what is done."
         advice = "compute the reward from the action, or from the state that it leads to."
@@ -193,7 +199,8 @@ def _scale(seen: Seen) -> Iterator[EnvFinding]:
 def _discount(seen: Seen) -> Iterator[EnvFinding]:
     """Whether the discount leaves something of the first reward."""
     if seen.reach is not None:
-        distance, how = seen.reach[1], "is"
+        distance: int | None = seen.reach[1]
+        how = "is"
     else:  # the soonest of a sample is far from it; where held actions come to it alike, it may be it
         times = np.sort(seen.steps.time[seen.paid]) + 1
         distance = int(times[0]) if len(times) > 1 and times[0] == times[1] else None

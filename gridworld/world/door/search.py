@@ -190,7 +190,7 @@ class Search:
         is_continuous = isinstance(space, spaces.Box) and space.dtype.kind == "f"
         if not (is_continuous and "more than comparisons" in str(error)):
             return error
-        continuous = "its states are continuous, and only finite worlds have an exact optimum"
+        continuous = "its states are continuous: only finite worlds have an exact optimum"
         return self.refusal(f"{continuous} ({str(error).partition(': ')[2]})")
 
     def _everything(self, *held: Any) -> bytes:

@@ -258,7 +258,7 @@ def test_a_table_that_is_none_is_refused(changed, told):
         ("no_module.here:Any-v0", {}, "env.id=no_module.here:Any-v0: no module no_module; install"),
         (":Any-v0", {}, "env.id=:Any-v0: is not registered with Gymnasium"),
         ("gymnasium:Lake-v1", {}, "the module gymnasium has no Lake-v1, nor is it registered with"),
-        ("CartPole-v1", {}, r"its states are continuous, .*cartpole.py"),
+        ("CartPole-v1", {}, r"its states are continuous: .*cartpole.py"),
         ("FrozenLake-v1", {"is_slipery": True}, "env.kwargs={is_slipery: True}: .*argument 'is_slipery'"),
         ("FrozenLake-v1", {"map_name": "9x9"}, "env.kwargs={map_name: 9x9}: FrozenLake-v1 cannot be made"),
         ("FrozenLake-v1", {"map_name": None}, "a different table each time it is made"),

@@ -1,0 +1,168 @@
+"""`examine` says what it counted, and finds faults of each kind in more than one form."""
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.spaces import Box
+from helpers.faulty_envs import Start, Walk
+
+from gridworld.checking.examine import ExamineResult, examine
+
+STEPS = 2_000
+
+
+def fact(result: ExamineResult, label: str) -> str:
+    return dict(result.facts)[label]
+
+
+def evidence(result: ExamineResult, topic: str) -> str:
+    return " ".join(each.evidence for each in result.findings if each.topic == topic)
+
+
+class Ends(Walk):
+    """Begins in the middle; both ends are over, and pay as much as `pays` has for them and for a step."""
+
+    size: int = 3
+    pays: ClassVar[tuple[float, float, float]] = (-0.3, 0.0, 1.0)
+
+    def reset(self, **kwargs: Any) -> Start:
+        super().reset(**kwargs)
+        self.place = self.size // 2
+        return self.show(), {}
+
+    def over(self) -> bool:
+        return self.place in (0, self.size - 1)
+
+    def pay(self, action: Any) -> float:
+        return self.pays[0 if self.place == 0 else 1 + (self.place == self.size - 1)]
+
+
+class CostlyEnds(Ends):
+    size, pays = 5, (-0.3, -1.0, 1.0)
+
+
+class LastChance(Ends):
+    size, pays = 5, (0.5, 0.1, 1.0)
+
+
+@pytest.mark.parametrize("env", [Ends, CostlyEnds])
+def test_only_what_is_called_the_reward_is_counted(env: Any) -> None:
+    """By symmetry half of the episodes end on the right; those on the left pay more than a step, too."""
+    assert fact(examine(env, steps=STEPS), "random policy").endswith("in 50.0% of its episodes (exact)")
+
+
+def test_several_rewards_are_named_by_what_they_are_above() -> None:
+    text = fact(examine(LastChance, steps=STEPS), "random policy")
+    assert text.startswith("comes to a reward above 0.1, 2 steps away at the soonest, in ")
+
+
+class Coin(Walk):
+    """Any action reaches the goal, of which a draw is one time in five too little, at most eight times."""
+
+    size, limit = 2, 8
+
+    def move(self, action: Any) -> None:
+        self.place = int(self.np_random.integers(5) > 0)
+
+
+class Straight(Walk):
+    """The reward comes after five steps, whatever is done."""
+
+    def move(self, action: Any) -> None:
+        self.place += 1
+
+
+def test_a_probability_is_never_rounded_to_1() -> None:
+    assert f"{1 - 0.2**8:.4%}" == "99.9997%"
+    assert "in 99.9997% of its episodes (exact)" in fact(examine(Coin, steps=STEPS), "random policy")
+    assert "5 steps away at the soonest, in every episode" in fact(
+        examine(Straight, steps=STEPS), "random policy"
+    )
+
+
+class Fall(Walk):
+    """A pole: its end pays -1, and every other step nothing, so that there is nothing to find."""
+
+    def pay(self, action: Any) -> float:
+        return -float(self.over())
+
+
+def test_an_end_that_only_costs_is_not_called_a_reward() -> None:
+    result = examine(Fall, steps=STEPS)
+    assert result.passed, str(result)
+    assert "on average" in fact(result, "random policy")
+
+
+class Timed(Walk):
+    """Pays the same at each of six steps, whatever is done, and shows what is done."""
+
+    pays: float = -1.0
+    size = 2**7
+
+    def move(self, action: Any) -> None:
+        self.place = 2 * max(self.place, 1) + int(action)
+
+    def over(self) -> bool:
+        return self.place >= 2**6
+
+    def pay(self, action: Any) -> float:
+        return self.pays
+
+
+class TimedAndPaid(Timed):
+    pays = 1.0
+
+
+class TimedAtRandom(Timed):
+    """The same, for as many steps as a reset draws, of a state that cannot be enumerated."""
+
+    noise = 0.0
+
+    def reset(self, **kwargs: Any) -> Start:
+        super().reset(**kwargs)
+        self.observation_space = Box(0.0, 9.0, (2,), np.float64)
+        self.left, self.noise = int(self.np_random.integers(3, 6)), self.np_random.uniform()
+        return self.show(), {}
+
+    def show(self) -> Any:
+        return np.array([self.noise, getattr(self, "left", 0)])
+
+    def move(self, action: Any) -> None:
+        self.left -= 1
+        self.noise = (self.noise + 0.3 * int(action)) % 1.0
+
+    def over(self) -> bool:
+        return self.left == 0
+
+
+@pytest.mark.parametrize("env", [Timed, TimedAndPaid, TimedAtRandom])
+def test_where_every_step_pays_alike_whatever_is_done_it_is_said(env: Any) -> None:
+    result = examine(env, steps=STEPS)
+    assert result.topics == ["reward"], str(result)
+
+
+def test_where_every_step_costs_alike_and_acting_ends_it_sooner_nothing_is_found() -> None:
+    class Sooner(Walk):
+        def pay(self, action: Any) -> float:
+            return -1.0
+
+    result = examine(Sooner, steps=STEPS)
+    assert result.passed, str(result)
+    assert fact(result, "rewards") == "always -1"
+    assert fact(result, "random policy").startswith("comes to an end, 5 steps away at the soonest")
+
+
+def test_a_world_that_is_not_finite_is_called_continuous_and_its_space_is_shown_whole() -> None:
+    result = examine("CartPole-v1", steps=STEPS)
+    assert "continuous: only finite worlds have an exact optimum" in fact(result, "states")
+    space = " ".join(str(gym.make("CartPole-v1").observation_space).split())
+    assert fact(result, "observations").endswith(space)
+    assert max(map(len, str(result).splitlines())) <= 100
+
+
+def test_what_cannot_be_enumerated_says_why_as_other_commands_do() -> None:
+    assert "its actions are Box(-2.0, 2.0, (1,), float32)" in fact(
+        examine("Pendulum-v1", steps=200), "states"
+    )
