@@ -16,7 +16,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from gridworld.base.bounds import STEP_LIMIT, Bounds, discount
-from gridworld.base.errors import InputError, in_short
+from gridworld.base.errors import GYMNASIUM, InputError, in_short, on_a_line
 from gridworld.checking.function import SingleEnv
 from gridworld.checking.sampling import Actions, Env, Replays, generators_restored, replays, sample
 from gridworld.checking.seen import ERROR, EnvFinding, Seen
@@ -172,25 +172,22 @@ def _made(name: str, make: Make) -> Env:
 
 def _first_look(env: Env, make: Make, seed: int) -> str:
     """What is wrong with the results of reset() and step(), a sentence; "" for nothing."""
-    call, actions = "reset(seed=0)", Actions(env.action_space, seed).of_episode(0)
+    call, action = "reset(seed=0)", next(Actions(env.action_space, seed).of_episode(0))
     try:
-        result = make().reset(seed=0)
+        result: Any = make().reset(seed=0)
         if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
-            return f"{call} returns {_kind(result)}, must be (observation, info)."
+            return f"reset() returns {on_a_line(result)}, as in the old Gym: {GYMNASIUM}."
         env.reset(seed=0)
-        call = "step()"
-        stepped: Any = env.step(next(actions))
-        if not (isinstance(stepped, tuple) and len(stepped) == 5):
-            five = "(observation, reward, terminated, truncated, info)"
-            return f"{call} returns {_kind(stepped)}, must be {five}."
-        float(stepped[1])
+        call = f"a step with action {action}"
+        result = env.step(action)
+        if not (isinstance(result, tuple) and len(result) == 5):
+            return f"step() returns {on_a_line(result)}, as in the old Gym: {GYMNASIUM}."
+        if np.ndim(result[1]):
+            return f"{call} pays an array of shape {np.shape(result[1])}; must be a number."
+        float(result[1])
     except Exception as error:  # anybody's code
         return f"{call} raises {in_short(error)}."
     return ""
-
-
-def _kind(value: Any) -> str:
-    return f"a tuple of {len(value)}" if isinstance(value, tuple) else f"a {type(value).__name__}"
 
 
 def _interface(make: Make) -> str:

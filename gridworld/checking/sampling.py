@@ -57,6 +57,8 @@ class Steps:
     changed: int  # arrays that the next step changed, of the first that were returned
     draws: bool  # whether a step changed the state of a random generator
     failure: str  # what a step raised, if one did
+    mistyped: str  # what is wrong with the type of a flag
+    largest: dict[str, float]  # the largest number in observations that SB3 takes for images, by their names
 
     @property
     def last(self) -> IntArray:
@@ -130,14 +132,19 @@ def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
     acts: dict[bytes, int] = {}
     vectors: list[FloatArray | None] = []
     outside: dict[int, str] = {}
-    changed, draws, failure, episode, until = 0, False, "", 0, time.monotonic() + _SECONDS
+    changed, draws, failure, mistyped, episode, until = 0, False, "", "", 0, time.monotonic() + _SECONDS
+    largest: dict[str, float] = {}
 
     def number(observation: Any, key: bytes) -> int:
         if key not in numbers:
             numbers[key] = len(numbers)
             if reason := _outside(env.observation_space, observation):
                 outside[numbers[key]] = reason
-            vectors.append(_vector(env.observation_space, observation))
+            parts = [*parts_of(env.observation_space, observation)]
+            vectors.append(_vector(parts))
+            for name, space, part in parts:
+                if is_image(space) and isinstance(part, np.ndarray):
+                    largest[name] = max(largest.get(name, 0), np.max(part, initial=0))
         return numbers[key]
 
     while len(rows) < most and time.monotonic() < until and not failure:
@@ -154,6 +161,7 @@ def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
                     draws |= states != _states(generators)
                     changed += content(observation) != key
                 observation, key = after, content(after)
+                mistyped = mistyped or _mistyped(terminated, truncated)
                 ends = bool(terminated), bool(truncated)
                 act = acts.setdefault(content(action), len(acts))
                 row = (episode, taken, before, act, float(reward), number(after, key), *ends)
@@ -176,6 +184,8 @@ def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
         changed=changed,
         draws=draws,
         failure=failure,
+        mistyped=mistyped,
+        largest=largest,
     )
 
 
@@ -275,18 +285,37 @@ def _short(value: Any) -> str:
     return f"{type(value).__name__} {' '.join(str(value).split())[:60]}"
 
 
-def boxes(space: gym.Space[Any]) -> list[str | None]:
-    """The keys of the boxes in an observation space; None for the space itself."""
-    if isinstance(space, spaces.Dict):
-        return [key for key, each in space.items() if isinstance(each, spaces.Box)]
-    return [None] if isinstance(space, spaces.Box) else []
+def _mistyped(terminated: Any, truncated: Any) -> str:
+    """What is wrong with the type of a flag, as the rest of a sentence; "" for nothing."""
+    for name, flag in (("terminated", terminated), ("truncated", truncated)):
+        if not isinstance(flag, bool | np.bool_):
+            return f"returns {name}={flag} of type {type(flag).__name__}; must be a bool"
+    return ""
 
 
-def _vector(space: gym.Space[Any], observation: Any) -> FloatArray | None:
-    parts = [observation if key is None else observation[key] for key in boxes(space)]
-    if sum(np.size(part) for part in parts) > _MOST_NUMBERS:
+def parts_of(
+    space: gym.Space[Any], observation: Any = None, name: str = ""
+) -> Iterator[tuple[str, gym.Space[Any], Any]]:
+    """The spaces in a space, each with its name, and the part of an observation that is of it."""
+    if not isinstance(space, spaces.Dict | spaces.Tuple):
+        yield name, space, observation
+        return
+    for key, each in space.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces):
+        yield from parts_of(each, None if observation is None else observation[key], f"{name}[{key!r}]")
+
+
+def is_image(space: gym.Space[Any]) -> bool:
+    """Whether SB3 takes observations of a space for images, which it divides by 255."""
+    if not isinstance(space, spaces.Box) or len(space.shape) != 3 or space.dtype != np.uint8:
+        return False
+    return bool((space.low == 0).all() and (space.high == 255).all())
+
+
+def _vector(parts: Sequence[tuple[str, gym.Space[Any], Any]]) -> FloatArray | None:
+    boxes = [part for _, space, part in parts if isinstance(space, spaces.Box)]
+    if not boxes or sum(map(np.size, boxes)) > _MOST_NUMBERS:
         return None
     try:
-        return np.concatenate([np.asarray(part, np.float64).ravel() for part in parts]) if parts else None
+        return np.concatenate([np.asarray(part, np.float64).ravel() for part in boxes])
     except (TypeError, ValueError):
         return None

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from gridworld.checking.hidden import hidden
-from gridworld.checking.sampling import LONGEST, boxes
+from gridworld.checking.sampling import LONGEST, parts_of
 from gridworld.checking.seen import ENDINGS, ERROR, UNLIMITED, WARNING, EnvFinding, Seen
 from gridworld.world.metrics import wilson_interval
 
@@ -21,6 +21,7 @@ _LEAST_REACHED = 1e-3  # of episodes of a random policy that come to the reward
 _ALIKE = 1e-9  # returns, relative to the largest reward
 _LEAST_LEFT = 0.05  # of the first reward under the discount
 _LARGE, _SMALL = 1e3, 1e-3  # rewards
+_DARK = 64  # the largest number of what is hardly an image
 _LARGE_INPUT = 10.0  # root mean square of a number that is observed
 
 
@@ -29,9 +30,37 @@ def _interface(seen: Seen) -> Iterator[EnvFinding]:
     if failure := seen.steps.failure:
         advice = "correct that first; it may be the cause of the rest."
         yield EnvFinding("interface", ERROR, f"{failure.rstrip('.')}.", advice)
+    if mistyped := seen.steps.mistyped:
+        evidence = f"step() {mistyped}."
+        yield EnvFinding(
+            "interface", WARNING, evidence, "convert it in step(); libraries differ in what they do."
+        )
     if count := seen.steps.changed:
         evidence = f"{count} of the first returned observations were changed by the next step."
         yield EnvFinding("interface", ERROR, evidence, "return a copy, e.g. self.state.copy().")
+
+
+def _spaces(seen: Seen) -> Iterator[EnvFinding]:
+    """Spaces that SB3 takes for something else."""
+    for what, space in (("action", seen.env.action_space), ("observation", seen.env.observation_space)):
+        for name, each, _ in parts_of(space):
+            if isinstance(each, spaces.Discrete | spaces.MultiDiscrete) and np.any(each.start):
+                does = "sends numbers from 0" if what == "action" else "encodes numbers from 0, and may fail"
+                evidence = f"{what}s{name} are {each}, but SB3 {does}."
+                wrapper = f"gymnasium.wrappers.Transform{what.capitalize()}"
+                advice = f"let the space begin at 0 and move the numbers in step(), or use {wrapper}."
+                yield EnvFinding("space", WARNING, evidence, advice)
+    for name, largest in seen.steps.largest.items():
+        if 0 < largest < _DARK:
+            evidence = (
+                f"observations{name} are uint8 from 0 to 255 with three axes, which SB3 takes for images and "
+                f"divides by 255; the largest number is {largest:g}, of which {largest / 255:.2g} is left."
+            )
+            advice = (
+                "give the Box its real bounds, show codes as one-hot vectors, or use SB3's "
+                "policy_kwargs=dict(normalize_images=False)."
+            )
+            yield EnvFinding("observation", WARNING, evidence, advice)
 
 
 def _values(seen: Seen) -> Iterator[EnvFinding]:
@@ -219,7 +248,7 @@ def _observation(seen: Seen) -> Iterator[EnvFinding]:
         advice = "return what the step changed; make the observation after the state changes."
         yield EnvFinding("observation", ERROR, evidence, advice)
     is_image = isinstance(space, spaces.Box) and len(space.shape) == 3
-    if steps.vectors is None or is_image or not boxes(space):
+    if steps.vectors is None or is_image:
         return
     values = np.nan_to_num(steps.vectors[steps.before], posinf=0, neginf=0)
     sizes = np.sqrt(np.mean(values**2, axis=0))
@@ -244,13 +273,25 @@ def _markov(seen: Seen) -> Iterator[EnvFinding]:
 
 def _checker(seen: Seen) -> Iterator[EnvFinding]:
     """What Gymnasium's checker says, unless it is known better."""
-    known = seen.steps.failure or seen.steps.outside or not seen.replays.repeats
+    known = seen.steps.failure or seen.steps.mistyped or seen.steps.outside or not seen.replays.repeats
     if seen.interface and not known:
         advice = "correct that; gymnasium.utils.env_checker.check_env repeats the check."
         yield EnvFinding("interface", WARNING, f"{seen.interface.rstrip('.')}.", advice)
 
 
 ALL: tuple[Callable[[Seen], Iterator[EnvFinding]], ...] = (
-    *(_interface, _values, _seed, _ends, _actions, _reward, _scale, _discount, _observation, _markov),
+    *(
+        _interface,
+        _spaces,
+        _values,
+        _seed,
+        _ends,
+        _actions,
+        _reward,
+        _scale,
+        _discount,
+        _observation,
+        _markov,
+    ),
     _checker,
 )

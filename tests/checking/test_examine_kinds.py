@@ -5,8 +5,10 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.spaces import Box
+import torch
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
 from helpers.faulty_envs import Start, Walk
+from stable_baselines3.common.preprocessing import preprocess_obs
 
 from gridworld.checking.examine import ExamineResult, examine
 
@@ -166,3 +168,156 @@ def test_what_cannot_be_enumerated_says_why_as_other_commands_do() -> None:
     assert "its actions are Box(-2.0, 2.0, (1,), float32)" in fact(
         examine("Pendulum-v1", steps=200), "states"
     )
+
+
+class Shows(Walk):
+    """Shows its place by a function, and takes actions of a space."""
+
+    space: ClassVar[Any] = Discrete(6)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = self.space
+
+    def move(self, action: Any) -> None:
+        super().move(int(np.max(action)) == int(np.max(getattr(self.action_space, "start", 0))) + 1)
+
+
+class ActsFromOne(Shows):
+    action_space = Discrete(2, start=1)
+
+
+class ActsFromMinusOne(Shows):
+    action_space = MultiDiscrete([2], start=[-1])
+
+
+class ShowsFromThree(Shows):
+    space = Discrete(6, start=3)
+
+    def show(self) -> Any:
+        return self.place + 3
+
+
+class ShowsFromThreeInADict(ShowsFromThree):
+    space = Dict({"place": ShowsFromThree.space})
+
+    def show(self) -> Any:
+        return {"place": self.place + 3}
+
+
+class ShowsFromThreeInATuple(ShowsFromThree):
+    space = Tuple([Discrete(6), MultiDiscrete([6], start=[3])])
+
+    def show(self) -> Any:
+        return self.place, np.array([self.place + 3])
+
+
+@pytest.mark.parametrize(
+    ("env", "words"),
+    [
+        (ActsFromOne, "actions are Discrete(2, start=1), but SB3 sends numbers from 0"),
+        (ActsFromMinusOne, "actions are MultiDiscrete([2], start=[-1]), but SB3 sends"),
+        (ShowsFromThree, "observations are Discrete(6, start=3), but SB3 encodes"),
+        (ShowsFromThreeInADict, "observations['place'] are Discrete(6, start=3), but"),
+        (ShowsFromThreeInATuple, "observations[1] are MultiDiscrete([6], start=[3]), but"),
+    ],
+)
+def test_spaces_that_do_not_begin_at_0_are_found(env: Any, words: str) -> None:
+    result = examine(env, steps=STEPS)
+    assert words in evidence(result, "space"), str(result)
+    assert result.topics == ["space"]
+
+
+class Codes(Shows):
+    """Codes up to `most` in an image of three axes."""
+
+    most = 10
+    space = Box(0, 255, (2, 3, 1), np.uint8)
+
+    def show(self) -> Any:
+        shown = np.zeros((2, 3, 1), np.uint8)
+        shown.flat[self.place] = self.most
+        return shown
+
+
+class CodesInADict(Codes):
+    space = Dict({"image": Codes.space, "place": Discrete(6)})
+
+    def show(self) -> Any:
+        return {"image": super().show(), "place": self.place}
+
+
+class LargeCodes(Codes):
+    """More numbers than are looked at one by one."""
+
+    space = Box(0, 255, (20, 20, 3), np.uint8)
+
+    def show(self) -> Any:
+        shown = np.zeros((20, 20, 3), np.uint8)
+        shown.flat[self.place] = self.most
+        return shown
+
+
+class Image(Codes):
+    most = 255
+
+
+class BoundedCodes(Codes):
+    space = Box(0, 10, (2, 3, 1), np.uint8)
+
+
+class FlatCodes(Codes):
+    space = Box(0, 255, (6,), np.uint8)
+
+    def show(self) -> Any:
+        return super().show().ravel()
+
+
+@pytest.mark.parametrize("env", [Codes, CodesInADict, LargeCodes, Image, BoundedCodes, FlatCodes])
+def test_codes_that_sb3_divides_by_255_are_found_and_no_others(env: Any) -> None:
+    shown, space = env().show(), env().observation_space
+    if isinstance(space, Dict):
+        shown, space = shown["image"], space["image"]
+    largest = float(preprocess_obs(torch.as_tensor(shown[None]), space).max())  # type: ignore[union-attr]
+    result = examine(env, steps=STEPS)
+    if largest < 0.1:
+        assert f"the largest number is 10, of which {largest:.2g} is left" in evidence(result, "observation")
+    else:
+        assert result.passed, str(result)
+
+
+class IntFlags(Walk):
+    def over(self) -> Any:
+        return int(super().over())
+
+
+class ArrayFlags(Walk):
+    def cut(self) -> Any:
+        return np.array([super().cut()])
+
+
+class ArrayRewards(Walk):
+    def pay(self, action: Any) -> Any:
+        return np.array([super().pay(action)])
+
+
+class NumpyFlags(Walk):
+    """Learners take them as what they are."""
+
+    def over(self) -> Any:
+        return np.bool_(super().over())
+
+
+@pytest.mark.parametrize(
+    ("env", "words"),
+    [
+        (IntFlags, "returns terminated=0 of type int; must be a bool"),
+        (ArrayFlags, "returns truncated=[False] of type ndarray; must be a bool"),
+        (ArrayRewards, "pays an array of shape (1,); must be a number"),
+        (NumpyFlags, ""),
+    ],
+)
+def test_flags_and_rewards_of_another_type_are_named(env: Any, words: str) -> None:
+    result = examine(env, steps=STEPS)
+    assert words in evidence(result, "interface"), str(result)
+    assert result.topics == ["interface"] * bool(words), str(result)

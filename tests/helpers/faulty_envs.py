@@ -426,6 +426,6 @@ FAULTS: tuple[tuple[Any, Any, str, str], ...] = (
     (Cart, BlindCart, "markov", "unexplained"),
     (Near, Far, "discount", "399 steps away"),
     (ShortLock, Lock, "exploration", "(exact)"),
-    (Walk, OldInterface, "interface", "must be (observation, info)"),
+    (Walk, OldInterface, "interface", "must return (observation, info)"),
     (Walk, Raises, "interface", "raises IndexError: cell 4"),
 )
