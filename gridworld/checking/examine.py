@@ -100,7 +100,7 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
     discount("gamma", gamma)
     Bounds(low=100).check("steps", steps)
     began = time.monotonic()
-    with generators_restored(), warnings.catch_warnings(), np.errstate(all="ignore"):
+    with generators_restored(env), warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         name, make, mdp = _subject(env)
         first = _made(name, make)
@@ -114,7 +114,7 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
         rate, replayed = len(found.before) / max(time.monotonic() - started, 1e-3), Replays()
         mdp, refusal = _exact(make) if mdp is None else (mdp, "")
         try:
-            replayed = replays(make, Actions(first.action_space, seed), rate)
+            replayed = replays(make, Actions(first.action_space, seed), found, rate)
         except Exception as error:  # anybody's code
             found.failure = found.failure or f"a replayed episode raises {in_short(error)}"
         limit = step_limit(first) or (None if mdp is None else mdp.max_episode_steps)

@@ -11,6 +11,7 @@ import copy
 import itertools
 import random
 import time
+import types
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,7 +22,16 @@ import numpy as np
 from gymnasium import spaces
 
 from gridworld.base.errors import in_short
-from gridworld.world.door.attributes import GENERATORS, random_states, state_of
+from gridworld.world.door.attributes import (
+    GENERATORS,
+    attributes,
+    holders_of,
+    layers_of,
+    own_spaces,
+    random_states,
+    spaces_in,
+    state_of,
+)
 from gridworld.world.door.observations import content
 from gridworld.world.door.traits import contents
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
@@ -37,6 +47,10 @@ _WATCHED = 300  # first steps, in which returned arrays and generators are watch
 _MOST_NUMBERS = 256  # of an observation; more, as of an image, are not looked at
 _SECONDS = 15.0  # for the sample
 _REPLAYED = 10.0  # seconds, for the replays; fewer steps where that is not enough
+_ENDED, _TRIES = 3.0, 20  # seconds and episodes, for those that end as some of the sample did
+_DEEP = 4  # objects in objects
+_ITS = "its generator"
+_NOT_HELD = (gym.Env, gym.Space, type, types.ModuleType, types.FunctionType, types.MethodType)
 
 
 @dataclass
@@ -58,6 +72,7 @@ class Steps:
     draws: bool  # whether a step changed the state of a random generator
     failure: str  # what a step raised, if one did
     mistyped: str  # what is wrong with the type of a flag
+    acts: list[Any]  # the actions by their numbers
     largest: dict[str, float]  # the largest number in observations that SB3 takes for images, by their names
 
     @property
@@ -78,7 +93,7 @@ class Replays:
     repeats: bool = True
     causes: list[str] = field(default_factory=list)  # what it draws from besides `np_random`
     survivors: list[str] = field(default_factory=list)  # attributes that a reset does not restore
-    starts: int = 1  # different first observations
+    after: str = "other"  # the episodes after which it does not
     plays: list[list[Play]] = field(default_factory=list)
 
 
@@ -112,24 +127,26 @@ class Actions:
 
 
 @contextmanager
-def generators_restored() -> Iterator[None]:
-    """Leave the generators that all share as they were."""
-    states = random.getstate(), np.random.get_state()
+def generators_restored(env: Any) -> Iterator[None]:
+    """Leave the generators that all share, and those of an environment's spaces, as they were."""
+    states, layers = (random.getstate(), np.random.get_state()), layers_of(env)
+    own = [(each, each._np_random) for layer in layers for each in spaces_in(own_spaces(layer))]
     try:
         yield
     finally:
         random.setstate(states[0])
         np.random.set_state(states[1])
+        for space, generator in own:
+            space._np_random = generator
 
 
 def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
     """Take about so many steps, with one seed for everything."""
-    random.seed(seed)
-    np.random.seed(seed)
-    generators = _generators(env)
+    seed_all(env, seed)
     rows: list[tuple[Any, ...]] = []
     numbers: dict[bytes, int] = {}
     acts: dict[bytes, int] = {}
+    taken_acts: list[Any] = []
     vectors: list[FloatArray | None] = []
     outside: dict[int, str] = {}
     changed, draws, failure, mistyped, episode, until = 0, False, "", "", 0, time.monotonic() + _SECONDS
@@ -153,17 +170,19 @@ def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
         try:
             observation, _ = env.reset(seed=seed if episode == 0 else None)
             key = content(observation)
+            generators = generators_of(env) if len(rows) < _WATCHED else []
             for taken, action in enumerate(actions.of_episode(episode)):
                 before = number(observation, key)
-                states = _states(generators) if len(rows) < _WATCHED else None
+                states = _states(env, generators) if len(rows) < _WATCHED else None
                 after, reward, terminated, truncated, _ = env.step(copy.copy(action))
                 if states is not None:
-                    draws |= states != _states(generators)
+                    draws |= states != _states(env, generators)
                     changed += content(observation) != key
                 observation, key = after, content(after)
                 mistyped = mistyped or _mistyped(terminated, truncated)
                 ends = bool(terminated), bool(truncated)
                 act = acts.setdefault(content(action), len(acts))
+                taken_acts += [action] * (act == len(taken_acts))
                 row = (episode, taken, before, act, float(reward), number(after, key), *ends)
                 rows.append((*row, episode % 2 == 0))
                 if any(ends) or taken + 1 >= LONGEST:
@@ -185,60 +204,81 @@ def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
         draws=draws,
         failure=failure,
         mistyped=mistyped,
+        acts=taken_acts,
         largest=largest,
     )
 
 
-def replays(make: Callable[[], Env], actions: Actions, rate: float) -> Replays:
-    """Replay actions in one environment, in a new one, and with other seeds of the shared generators."""
-    found = Replays()
+def replays(make: Callable[[], Env], actions: Actions, sampled: Steps, rate: float) -> Replays:
+    """Replay actions in one environment, in a new one, and with other seeds of what it draws from."""
+    found, drawn = Replays(), set[str]()
     steps = int(np.clip(_REPLAYED * rate / (len(SEEDS) * (6 * 3 + _POOL)), 5, _HORIZON))
     lists = [list(itertools.islice(actions.of_episode(kind), steps)) for kind in (0, 1, 3)]
 
-    def plays(env: Env | None, shared: tuple[int, int], which: Sequence[list[Any]]) -> list[list[Play]]:
-        random.seed(shared[0])
-        np.random.seed(shared[1])
-        env = make() if env is None else env
-        return [[_play(env, each, seed, shared) for each in which] for seed in SEEDS]
+    def plays(env: Env, which: Sequence[list[Any]], other: str = "") -> list[list[Play]]:
+        return [[_play(env, each, seed, drawn, other) for each in which] for seed in SEEDS]
 
     env = make()
-    base = plays(env, (1, 1), lists)
-    found.starts = len({each[0][0][0] for each in base})
-    again, new, newer = plays(env, (1, 1), lists), plays(None, (1, 1), lists), plays(None, (1, 1), lists)
-    for name, shared in (("the module random", (2, 1)), ("numpy.random", (1, 2))):
-        if new == newer != plays(None, shared, lists):
-            found.causes.append(name)
-    own = [name for name, value in vars(env.unwrapped).items() if type(value) in GENERATORS]
-    own = [name for name in own if name != "_np_random"]
-    found.repeats = base == again == new and not found.causes
+    base, again, new = plays(env, lists), plays(env, lists), plays(make(), lists)
+    found.causes = [name for name in sorted(drawn) if plays(make(), lists, name) != new]
     if base != again or base != new:
-        found.causes += [f"its generator {name}" for name in own]
-        if new == newer and not own:
-            found.survivors = _survivors(make, env)
+        if new == plays(make(), lists):
+            found.survivors = _survivors(make(), env)
+        else:  # made or drawn from as the environment is made, or by a reset
+            own = [name for name, _ in generators_of(env) if name.startswith(_ITS)]
+            found.causes += [name for name in own if name not in found.causes]
+    elif not found.causes:
+        _try_ends(found, make, sampled, _ENDED * rate, (lists[0], base[0][0]))
+    found.repeats = base == again == new and not found.causes and not found.survivors
     if base == new:
-        held = [[action] * steps for action in actions.pool]
-        held_plays = plays(None, (1, 1), held)
+        held_plays = plays(make(), [[action] * steps for action in actions.pool])
         found.plays = [one + two for one, two in zip(base, held_plays, strict=True)]
     return found
 
 
-def _survivors(make: Callable[[], Env], used: Env) -> list[str]:
+def _try_ends(found: Replays, make: Callable[[], Env], sampled: Steps, left: float, usual: Any) -> None:
+    """Look for what a reset does not restore after episodes that end as some of the sample did."""
+    for name in ("truncated", "terminated"):
+        ends = sampled.last[getattr(sampled, name)[sampled.last]]
+        ends = ends[np.unique(sampled.after[ends], return_index=True)[1]]
+        for end in ends[np.argsort(sampled.time[ends], kind="stable")][:_TRIES].tolist():
+            begin = end - int(sampled.time[end])
+            if (left := left - (end - begin)) < 0:
+                return
+            actions, used, same = (
+                [sampled.acts[act] for act in sampled.action[begin : end + 1]],
+                make(),
+                make(),
+            )
+            for env in (used, same):
+                _play(env, actions, begin, set())
+            if _play(used, usual[0], SEEDS[0], set()) != usual[1]:
+                found.survivors, found.after = _survivors(make(), same), name
+                return
+
+
+def _survivors(fresh: Env, used: Env) -> list[str]:
     """The attributes that a reset leaves as an earlier episode made them; "" for one that is not found."""
-    keys = []
+    keys, inner = [], []
     try:
-        for env in (make(), used):
-            random.seed(1)
-            np.random.seed(1)
-            env.reset(seed=0)
+        for env in (fresh, used):
+            seed_all(env, 1)
+            env.reset(seed=SEEDS[0])
             keys.append(contents(env.unwrapped))
+            inner.append({name: content(each) for name, each in held_by(env.unwrapped) if _is_plain(each)})
     except Exception:  # whatever cannot be copied
         return [""]
-    return sorted(name for name in keys[0] | keys[1] if keys[0].get(name) != keys[1].get(name)) or [""]
+    differ = [name for name in inner[0] | inner[1] if inner[0].get(name) != inner[1].get(name)]
+    names = []
+    for name in sorted(name for name in keys[0] | keys[1] if keys[0].get(name) != keys[1].get(name)):
+        names += [each for each in differ if each.startswith((f"{name}.", f"{name}["))] or [name]
+    return names or [""]
 
 
-def _play(env: Env, actions: Sequence[Any], seed: int, shared: tuple[int, int]) -> Play:
-    random.seed(shared[0])
-    np.random.seed(shared[1])
+def _play(env: Env, actions: Sequence[Any], seed: int, drawn: set[str], other: str = "") -> Play:
+    """Play with known seeds, of the generator `other` with another; `drawn` gets those that it draws from."""
+    generators = seed_all(env, 1, other)
+    before = [_state(each) for _, each in generators]
     observation, _ = env.reset(seed=seed)
     found: Play = [(content(observation), 0.0, False, False)]
     for action in actions:
@@ -246,17 +286,64 @@ def _play(env: Env, actions: Sequence[Any], seed: int, shared: tuple[int, int]) 
         found.append((content(observation), float(reward), bool(terminated), bool(truncated)))
         if terminated or truncated:
             break
+    drawn |= {name for (name, each), then in zip(generators, before, strict=True) if _state(each) != then}
     return found
 
 
-def _generators(env: Env) -> list[Any]:
-    own = [value for value in vars(env.unwrapped).values() if type(value) in GENERATORS]
-    return [env.unwrapped, *own]
+def held_by(thing: Any, name: str = "", depth: int = _DEEP) -> Iterator[tuple[str, Any]]:
+    """What an object holds, and what is held there, by their names: robot.place, robots[0].place."""
+    if _is_plain(thing) or isinstance(thing, GENERATORS):
+        yield name, thing
+    elif depth < 0:
+        return
+    elif isinstance(thing, list | tuple | dict):
+        for key, each in thing.items() if isinstance(thing, dict) else enumerate(thing):
+            yield from held_by(each, f"{name}[{key!r}]", depth - 1)
+    elif depth == _DEEP or not isinstance(thing, _NOT_HELD):
+        for key, each in attributes(thing).items():
+            yield from held_by(each, f"{name}.{key}" if name else key, depth - 1)
 
 
-def _states(generators: Sequence[Any]) -> list[Any]:
-    env, *own = generators
-    return [*map(state_of, [env.np_random, *own]), *random_states()]
+def _is_plain(thing: Any) -> bool:
+    if isinstance(thing, list | tuple | set | dict):
+        return all(map(_is_plain, thing.values() if isinstance(thing, dict) else thing))
+    return thing is None or isinstance(thing, (bool, int, float, complex, str, bytes, np.generic, np.ndarray))
+
+
+def generators_of(env: Env) -> list[tuple[str, Any]]:
+    """The generators that an environment may draw from besides `np_random`, or spaces, with their names."""
+    everybodys: Any = (random.seed, np.random.get_state)
+    names = ("the module random", "numpy.random")
+    found = [(name, method.__self__) for name, method in zip(names, everybodys, strict=True)]
+    for layer in layers_of(env):
+        held = [(f"{_ITS} {name}", each) for name, each in held_by(layer) if name != "_np_random"]
+        for holder in holders_of(type(layer).__mro__):
+            held += [(f"{name} of {holder.__name__}", each) for name, each in vars(holder).items()]
+        found += [(name, each) for name, each in held if type(each) in GENERATORS]
+        for name in ("action_space", "observation_space"):
+            found += [(f"{name}.sample()", each) for each in spaces_in([getattr(layer, name, None)])]
+    return found
+
+
+def seed_all(env: Env, seed: int, other: str = "") -> list[tuple[str, Any]]:
+    """Seed all of `generators_of`, `other` with another seed."""
+    found = generators_of(env)
+    for name, each in found:
+        own = seed + (name == other)
+        if isinstance(each, np.random.Generator):
+            kind: Any = type(each.bit_generator)
+            each.bit_generator.state = kind(own).state
+        else:
+            each.seed(own)
+    return found
+
+
+def _state(generator: Any) -> bytes:
+    return state_of(generator.np_random if isinstance(generator, gym.Space) else generator)
+
+
+def _states(env: Env, generators: Sequence[tuple[str, Any]]) -> list[Any]:
+    return [state_of(env.unwrapped.np_random), *(_state(each) for _, each in generators), *random_states()]
 
 
 def _outside(space: gym.Space[Any], observation: Any) -> str:

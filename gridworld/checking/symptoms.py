@@ -84,7 +84,7 @@ def _seed(seen: Seen) -> Iterator[EnvFinding]:
     same = "the same seed and actions give another episode"
     if seen.replays.survivors:
         names = ", ".join(filter(None, seen.replays.survivors)) or "something"
-        evidence = f"{same} after other episodes: {names} is not restored by reset()."
+        evidence = f"{same} after {seen.replays.after} episodes: {names} is not restored by reset()."
         yield EnvFinding("reset", ERROR, evidence, "set in reset() all that an episode changes.")
     elif not seen.replays.repeats:
         causes = " and ".join(seen.replays.causes) or "something else, e.g. the clock"

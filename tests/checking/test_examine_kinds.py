@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
-from helpers.faulty_envs import Start, Walk
+from helpers.faulty_envs import Result, Slippery, Start, Walk
 from stable_baselines3.common.preprocessing import preprocess_obs
 
 from gridworld.checking.examine import ExamineResult, examine
@@ -321,3 +321,147 @@ def test_flags_and_rewards_of_another_type_are_named(env: Any, words: str) -> No
     result = examine(env, steps=STEPS)
     assert words in evidence(result, "interface"), str(result)
     assert result.topics == ["interface"] * bool(words), str(result)
+
+
+class ResumesWhenCut(Walk):
+    """A reset puts it at the start after an end only, so that a cut episode is resumed."""
+
+    is_over = True
+
+    def reset(self, **kwargs: Any) -> Start:
+        place = 0 if self.is_over else self.place
+        super().reset(**kwargs)
+        self.place, self.is_over = place, True
+        return self.show(), {}
+
+    def step(self, action: Any) -> Result:
+        result = super().step(action)
+        self.is_over = not result[3]
+        return result
+
+
+class ResumesLate(ResumesWhenCut):
+    """Later than a replay takes."""
+
+    size, limit = 16, 150
+
+
+class ResumesWhenOver(ResumesWhenCut):
+    """The other way round."""
+
+    def step(self, action: Any) -> Result:
+        result = super().step(action)
+        self.is_over = not result[2]
+        self.place = 3 if result[2] else self.place
+        return result
+
+
+class WithoutLimit(ResumesWhenCut):
+    limit = 10**9
+
+    def step(self, action: Any) -> Result:
+        result = super().step(action)
+        self.is_over = result[2]
+        return result
+
+
+def cut_from_outside() -> gym.Env[Any, Any]:
+    return gym.wrappers.TimeLimit(WithoutLimit(), 30)
+
+
+@pytest.mark.parametrize(
+    ("env", "after"),
+    [
+        (ResumesWhenCut, "truncated"),
+        (ResumesLate, "truncated"),
+        (cut_from_outside, "truncated"),
+        (ResumesWhenOver, "other"),
+    ],
+)
+def test_what_a_reset_keeps_after_some_ends_only_is_found(env: Any, after: str) -> None:
+    result = examine(env, steps=5_000)
+    assert f"after {after}" in evidence(result, "reset"), str(result)
+    assert "place is not restored by reset()" in evidence(result, "reset")
+    assert fact(result, "steps").endswith("a seed does not repeat an episode")
+
+
+class Robot:
+    def __init__(self) -> None:
+        self.place, self.looks = 0, "right"
+        self.rng = np.random.default_rng()
+
+
+class Warehouse(Slippery):
+    """A robot in an attribute, of which a reset forgets where it looks."""
+
+    slip, forgets = 0.0, True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = Discrete(2 * self.size)
+        self.robots = [Robot(), Robot()]
+
+    def reset(self, **kwargs: Any) -> Start:
+        if not self.forgets:
+            self.robots[0].looks = "right"
+        return super().reset(**kwargs)
+
+    def move(self, action: Any) -> None:
+        super().move(action)
+        self.robots[0].looks = "right" if action else "left"
+
+    def show(self) -> Any:
+        return self.place + self.size * (self.robots[0].looks == "left")
+
+
+class InnerGenerator(Warehouse):
+    slip, forgets = 0.2, False
+
+    def draw(self) -> float:
+        return float(self.robots[1].rng.random())
+
+
+RNG = np.random.default_rng()
+
+
+class ModulesGenerator(Slippery):
+    def draw(self) -> float:
+        return float(RNG.random())
+
+
+class SpacesGenerator(Slippery):
+    def draw(self) -> float:
+        return float(self.observation_space.sample()) / 6
+
+
+class SeededSpace(SpacesGenerator):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Start:
+        if seed is not None:
+            self.observation_space.seed(seed)
+        return super().reset(seed=seed)
+
+
+@pytest.mark.parametrize(
+    ("env", "topic", "words"),
+    [
+        (Warehouse, "reset", "episodes: robots[0].looks is not restored"),
+        (InnerGenerator, "seed", "draws from its generator robots[1].rng, which"),
+        (ModulesGenerator, "seed", f"draws from RNG of {__name__}, which"),
+        (SpacesGenerator, "seed", "draws from observation_space.sample(), which"),
+        (SeededSpace, "", ""),
+    ],
+)
+def test_what_is_kept_and_what_is_drawn_from_is_named(env: Any, topic: str, words: str) -> None:
+    result = examine(env, steps=STEPS)
+    assert words in evidence(result, topic), str(result)
+    assert result.topics == [topic] * bool(topic)
+
+
+def test_the_generators_of_a_given_environments_spaces_are_left_as_they_are() -> None:
+    env = SpacesGenerator()
+    for space in (env.action_space, env.observation_space):
+        space.seed(3)
+    before = [space.np_random.bit_generator.state for space in (env.action_space, env.observation_space)]
+    examine(env, steps=200)
+    after = [space.np_random.bit_generator.state for space in (env.action_space, env.observation_space)]
+    assert before == after
