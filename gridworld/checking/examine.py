@@ -118,7 +118,7 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
         except Exception as error:  # anybody's code
             found.failure = found.failure or f"a replayed episode raises {in_short(error)}"
         limit = step_limit(first) or (None if mdp is None else mdp.max_episode_steps)
-        seen = Seen(first, gamma, found, replayed, _interface(make), limit, mdp, refusal)
+        seen = Seen(first, make, gamma, found, replayed, _interface(make), limit, mdp, refusal)
         findings = [finding for symptom in ALL for finding in symptom(seen)]
         if mdp is not None and isinstance(env, str) and is_id(env):
             bounds = {"most_states": _MOST_STATES, "most_seconds": _SECONDS}

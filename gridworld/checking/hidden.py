@@ -1,41 +1,157 @@
 """Whether something hidden decides what follows: the time, what was drawn at reset, or the step before.
 
-In a deterministic environment, one observation and action with two outcomes is a proof. In a stochastic one,
-a chi-square test for each pair asks whether the frequencies of outcomes depend on the time or the step
-before. Of numbers that never come again, a regression asks whether the step before explains what they do not.
+Where the states can be enumerated, all of them that show the same are compared, which is exact, also of what
+beliefs about them would take too long to enumerate. Elsewhere, in a sample of an environment whose steps draw
+nothing, one observation and action with two outcomes is a proof.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import combinations_with_replacement
+import re
+from collections import Counter
+from collections.abc import Callable
+from fractions import Fraction
+from itertools import combinations, islice
+from typing import Any
 
 import numpy as np
-from gymnasium import spaces
-from scipy.special import chdtrc
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
+from gridworld.checking.sampling import held_by, is_plain
 from gridworld.checking.seen import Seen
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray
+from gridworld.world.door.observations import content
+from gridworld.world.door.search import Search, State
+from gridworld.world.mdp import BoolArray, IntArray
 
-_TESTED, _SURE, _EFFECT = 40, 1e-4, 0.25  # visits of a pair, p value after correction, Cramér's V
-_MOST_PAIRS = 200
-_MOST_INPUTS = 12  # numbers of an observation, and actions, of the regression
-_UNEXPLAINED = 0.2  # of the variance; the step before must explain three quarters of that
+_MOST_STATES, _SECONDS = 20_000, 10.0  # of a search
+_ALIASED = "its observations|observations stand for"  # in what is known of a world with beliefs
+_LOOKED_AT, _NAMED = 12, 3  # states that are compared by their attributes; attributes that are named
+_LEAST = 5  # conflicts, at least, that a cause must explain
 _TIME, _RESET, _BEFORE = "the step count", "what is drawn at reset", "the step before"
 _PAST = "more of the past than the step before"
 _ADVICE = {
     _TIME: "add the time to the observation (gymnasium.wrappers.TimeAwareObservation).",
-    _RESET: "show what reset() chooses, e.g. the place of the goal.",
-    _BEFORE: "show what is missing, e.g. a velocity or the last action, or use FrameStackObservation.",
-    _PAST: "show what is missing; a recurrent policy or stacked observations are second best.",
+    _RESET: "show {}, which reset() chooses, e.g. the place of the goal.",
+    _BEFORE: "show {}, e.g. a velocity or the last action, or use FrameStackObservation.",
+    _PAST: "show {}; a recurrent policy or stacked observations are second best.",
 }
 
 
 def hidden(seen: Seen) -> tuple[str, str] | None:
     """The evidence and the advice; None where nothing is found."""
-    pair, outcome, previous = _outcomes(seen)
-    found = (_by_chance if seen.steps.draws else _by_conflict)(seen, pair, outcome, previous)
-    return found or _by_regression(seen)
+    known = seen.refusal if seen.mdp is None else seen.mdp.truth
+    found = _by_states(seen) if re.search(_ALIASED, known) else None
+    if found or seen.mdp is not None:
+        return found
+    return None if seen.steps.draws else _by_conflict(seen)
+
+
+class _States(Search):
+    """A search that keeps the copies of all states."""
+
+    copies: dict[int, bytes]
+
+    def _added(self, copy: bytes, depth: int) -> State:
+        state = super()._added(copy, depth)
+        if state.number == 0:
+            self.copies = {}
+        self.copies[state.number] = copy
+        return state
+
+
+def _by_states(seen: Seen) -> tuple[str, str] | None:
+    """Compare the outcomes in states that show the same, exactly, and what tells these states apart."""
+    search = _States("env", seen.make(), most_states=_MOST_STATES, most_seconds=_SECONDS, compares=False)
+    try:
+        search.explore()
+    except Exception:  # its code may be anybody's
+        return None
+    limits = (search.layers.limit, seen.ends_at and seen.ends_at - 1, len(search.states))
+    limit = min(each for each in limits if each is not None)
+    states = [each for each in search.states if each.steps and each.depth < limit]
+    entered = [(-1, -1, each) for each in search.resets.starts]
+    entered += [
+        (state.number, action, step)
+        for state in states
+        for action, row in enumerate(state.steps)
+        for step in row
+        if not (step.terminated or step.truncated)
+    ]
+    shown: dict[int, set[bytes]] = {-1: {b""}}  # observations with which a state is entered
+    for _, _, step in entered:
+        shown.setdefault(step.following, set()).add(step.seen)
+    alike: dict[bytes, dict[Any, list[int]]] = {}  # states by what they show, and by what follows
+    for state in states:
+        for observation in shown[state.number]:
+            outcomes = _outcomes_in(state)
+            alike.setdefault(observation, {}).setdefault(outcomes, []).append(state.number)
+    conflicts = {observation: found for observation, found in alike.items() if len(found) > 1}
+    if not conflicts:
+        return None
+    origins, following = (
+        np.array(each) for each in zip(*((o, s.following) for o, _, s in entered), strict=True)
+    )
+    at, times = np.isin(np.arange(len(search.states)), following[origins < 0]), []
+    for _ in range(min(limit, 2 * max(each.depth for each in states) + 2)):
+        times.append(at)
+        at = np.isin(np.arange(len(at)), following[(origins >= 0) & at[origins]])
+    is_step = origins >= 0
+    links = coo_array((is_step[is_step], (origins[is_step], following[is_step])), (len(at), len(at)))
+    parts, when = connected_components(links, directed=False)[1], np.stack(times)
+    before: dict[tuple[int, bytes], set[Any]] = {}
+    for origin, action, step in entered:
+        earlier = {(action, each) for each in shown[origin]}
+        before.setdefault((step.following, step.seen), set()).update(earlier)
+    contexts: dict[str, Callable[[bytes, list[int]], set[Any]]] = {
+        _TIME: lambda _, states: set(np.flatnonzero(when[:, states].any(axis=1)).tolist()),
+        _RESET: lambda _, states: set(parts[states].tolist()),
+        _BEFORE: lambda shown, states: set().union(*(before[each, shown] for each in states)),
+    }
+    cause = _PAST
+    for name, context in contexts.items():
+        found = [[context(shown, each) for each in by.values()] for shown, by in conflicts.items()]
+        if all(sum(map(len, sets)) == len(set().union(*sets)) for sets in found):
+            cause = name
+            break
+    names = _names(search, conflicts)
+    evidence = (
+        f"in {len(conflicts):,} of {len(alike):,} observations the same action has different outcomes "
+        f"(exact): they depend on {cause}{f' ({names})' if names else ''}, which is not observed."
+    )
+    return evidence, _ADVICE[cause].format(names or "what is missing")
+
+
+def _outcomes_in(state: State) -> tuple[frozenset[Any], ...]:
+    """How likely each action is followed by what; of an end only if it pays, for sooner may be better."""
+    outcomes = []
+    for row in state.steps:
+        shares: dict[Any, Fraction] = {}
+        for share, _, seen, reward, over, _ in row:
+            key = seen, np.sign(reward) if over else round(reward, 9), over
+            shares[key] = shares.get(key, Fraction(0)) + share
+        outcomes.append(frozenset(shares.items()))
+    return tuple(outcomes)
+
+
+def _names(search: _States, conflicts: dict[bytes, dict[Any, list[int]]]) -> str:
+    """The fewest attributes in which two states of one observation, with different outcomes, differ."""
+    counts: Counter[tuple[str, ...]] = Counter()
+    for found in islice(conflicts.values(), _LOOKED_AT):
+        groups = [[_values(search, each) for each in states[:_LOOKED_AT]] for states in found.values()]
+        for group, other in combinations(groups[:_LOOKED_AT], 2):
+            pairs = [(one, two) for one in group for two in other]
+            differ = [tuple(sorted(name for name in one if one[name] != two.get(name))) for one, two in pairs]
+            counts[min(differ, key=len)] += 1
+    least = min((len(each) for each in counts if each), default=0)
+    names = max((each for each in counts if len(each) == least), key=lambda each: counts[each], default=())
+    return ", ".join(names) if len(names) <= _NAMED else ""
+
+
+def _values(search: _States, state: int) -> dict[str, bytes]:
+    search.layers.put(search.copies[state])
+    held = (each for layer in search.layers.layers for each in held_by(layer))
+    return {name: content(value) for name, value in held if is_plain(value)}
 
 
 def _numbers(*columns: IntArray | BoolArray) -> IntArray:
@@ -67,22 +183,29 @@ def _histories(time: IntArray, pair: IntArray) -> IntArray:
     return history
 
 
-def _by_conflict(seen: Seen, pair: IntArray, outcome: IntArray, previous: IntArray) -> tuple[str, str] | None:
+def _by_conflict(seen: Seen) -> tuple[str, str] | None:
     steps = seen.steps
+    pair, outcome, previous = _outcomes(seen)
     several = _several(pair, outcome)
     inside = several[pair]
     if not inside.any() or _only_the_end_pays_differently(seen, pair, inside):
         return None
-    cause = _PAST
+    cause, histories = _PAST, _histories(steps.time, pair)
     by = {_TIME: steps.time, _RESET: steps.episode, _BEFORE: previous}
     if seen.replays.plays and all(each[0] == seen.replays.plays[0][0] for each in seen.replays.plays):
         del by[_RESET]  # other seeds change nothing
-    elif _several(_histories(steps.time, pair), outcome).any():
+    elif _several(histories, outcome).any():
         cause, by = _RESET, {}  # all that could be seen was the same
+    usual = np.bincount(_numbers(pair, outcome))[_numbers(pair, outcome)] / np.bincount(pair)[pair]
     for name, context in by.items():
-        group = _numbers(pair[inside], context[inside])
-        again = np.bincount(group) > 1
-        if again.sum() >= 5 and (_several(group, outcome[inside]) & again).sum() <= 0.02 * again.sum():
+        asked = np.flatnonzero(inside)
+        if name != _RESET:  # one step of each history, since all of them have the same outcome
+            asked = asked[np.unique(histories[inside], return_index=True)[1]]
+        group = _numbers(pair[asked], context[asked])
+        size = np.bincount(group)
+        again = size > 1
+        by_chance = np.sum((1 - np.bincount(group, usual[asked]) / size)[again])
+        if by_chance >= _LEAST and (_several(group, outcome[asked]) & again).sum() <= 0.02 * again.sum():
             cause = name
             break
     one = int(np.argmax(inside))
@@ -96,7 +219,7 @@ def _by_conflict(seen: Seen, pair: IntArray, outcome: IntArray, previous: IntArr
         f"its steps draw nothing, yet {several.sum():,} of {np.sum(np.bincount(pair) > 1):,} pairs of "
         f"observation and action that came again had different outcomes (e.g. {kind}): they depend on "
         f"{cause}, which is not observed.",
-        _ADVICE[cause],
+        _ADVICE[cause].format("what is missing"),
     )
 
 
@@ -107,85 +230,3 @@ def _only_the_end_pays_differently(seen: Seen, pair: IntArray, inside: BoolArray
     rest = _numbers(steps.after, np.unique(rewards, return_inverse=True)[1], steps.terminated)
     signs = np.unique(np.sign(steps.reward[final]))
     return len(signs) == 1 and signs[0] != 0 and not _several(pair, rest).any()
-
-
-def _by_chance(seen: Seen, pair: IntArray, outcome: IntArray, previous: IntArray) -> tuple[str, str] | None:
-    counts = np.bincount(pair)
-    pairs = [each for each in np.argsort(-counts)[:_MOST_PAIRS].tolist() if counts[each] >= _TESTED]
-    times = np.digitize(seen.steps.time, np.quantile(seen.steps.time, [0.25, 0.5, 0.75]))
-    tests = {
-        name: [test for each in pairs if (test := _association(context[pair == each], outcome[pair == each]))]
-        for name, context in ((_BEFORE, previous), (_TIME, times))
-    }
-    count = sum(map(len, tests.values()))
-    for name, found in tests.items():
-        sure = [each for each in found if each[0] * count < _SURE and each[1] > _EFFECT]
-        if sure:
-            p, effect, visits = min(sure)
-            return (
-                f"in {len(sure)} of {len(found)} pairs of observation and action, what follows depends on "
-                f"{name} (Cramér's V {effect:.2f} in {visits} visits, p < {max(p * count, 1e-99):.0e} after "
-                f"correction for {count} tests).",
-                _ADVICE[name],
-            )
-    return None
-
-
-def _association(context: IntArray, outcome: IntArray) -> tuple[float, float, int] | None:
-    """The p value of independence by chi-square, Cramér's V and the visits; None where they are too few."""
-    table = np.zeros((int(context.max()) + 2, int(outcome.max()) + 1))
-    np.add.at(table, (context + 1, outcome), 1)
-    table = table[table.sum(axis=1) >= 10]
-    frequent = table.sum(axis=0) >= 10
-    table = np.column_stack([table[:, frequent], table[:, ~frequent].sum(axis=1)])
-    table = table[:, table.sum(axis=0) >= 10]
-    smaller = min(table.shape) - 1
-    if smaller < 1:
-        return None
-    expected = table.sum(axis=1)[:, None] * table.sum(axis=0) / table.sum()
-    if expected.min() < 1:
-        return None
-    chi = float(((table - expected) ** 2 / expected).sum())
-    p = float(chdtrc((table.shape[0] - 1) * (table.shape[1] - 1), chi))
-    return p, float(np.sqrt(chi / table.sum() / smaller)), len(context)
-
-
-def _by_regression(seen: Seen) -> tuple[str, str] | None:
-    steps, actions = seen.steps, seen.env.action_space
-    here = np.flatnonzero(steps.time > 0)
-    values = steps.vectors
-    if values is None or not np.isfinite(values).all() or not 1 <= values.shape[1] <= _MOST_INPUTS:
-        return None
-    if not isinstance(actions, spaces.Discrete) or actions.n > _MOST_INPUTS or len(here) < 1_000:
-        return None
-    if seen.observed < len(steps.time) / 4:  # they come again
-        return None
-    scaled = (values - values.mean(axis=0)) / (values.std(axis=0) + 1e-12)
-    now, then = scaled[steps.before[here]], scaled[steps.before[here - 1]]
-    one_hot = np.eye(int(steps.action.max()) + 1)
-    act, act_before = one_hot[steps.action[here]], one_hot[steps.action[here - 1]]
-    squares = [one * two for one, two in combinations_with_replacement(now.T, 2)]
-    inputs = np.column_stack(
-        [np.ones(len(now)), now, *squares, act, *(now * each[:, None] for each in act.T)]
-    )
-    for place, change in enumerate((values[steps.after[here]] - values[steps.before[here]]).T):
-        without, with_it = (
-            _unexplained(each, change) for each in (inputs, np.column_stack([inputs, then, act_before]))
-        )
-        if without > _UNEXPLAINED and with_it < without / 4:
-            return (
-                f"observation and action leave {without:.0%} of the variance of the change of its number "
-                f"{place} unexplained, with {_BEFORE} {with_it:.0%} (regression, {len(here) // 2:,} "
-                "held-out steps).",
-                _ADVICE[_BEFORE],
-            )
-    return None
-
-
-def _unexplained(inputs: Sequence[FloatArray] | FloatArray, target: FloatArray) -> float:
-    """The share of the variance of the second half that a regression on the first leaves."""
-    inputs, half = np.asarray(inputs), len(target) // 2
-    if target.std() < 1e-9:
-        return 0.0
-    weights = np.linalg.lstsq(inputs[:half], target[:half], rcond=None)[0]
-    return float(np.mean((target[half:] - inputs[half:] @ weights) ** 2) / max(target[half:].var(), 1e-30))

@@ -170,7 +170,7 @@ def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
         try:
             observation, _ = env.reset(seed=seed if episode == 0 else None)
             key = content(observation)
-            generators = generators_of(env) if len(rows) < _WATCHED else []
+            generators = generators_of(env)[2:] if len(rows) < _WATCHED else []
             for taken, action in enumerate(actions.of_episode(episode)):
                 before = number(observation, key)
                 states = _states(env, generators) if len(rows) < _WATCHED else None
@@ -265,7 +265,7 @@ def _survivors(fresh: Env, used: Env) -> list[str]:
             seed_all(env, 1)
             env.reset(seed=SEEDS[0])
             keys.append(contents(env.unwrapped))
-            inner.append({name: content(each) for name, each in held_by(env.unwrapped) if _is_plain(each)})
+            inner.append({name: content(each) for name, each in held_by(env.unwrapped) if is_plain(each)})
     except Exception:  # whatever cannot be copied
         return [""]
     differ = [name for name in inner[0] | inner[1] if inner[0].get(name) != inner[1].get(name)]
@@ -292,7 +292,7 @@ def _play(env: Env, actions: Sequence[Any], seed: int, drawn: set[str], other: s
 
 def held_by(thing: Any, name: str = "", depth: int = _DEEP) -> Iterator[tuple[str, Any]]:
     """What an object holds, and what is held there, by their names: robot.place, robots[0].place."""
-    if _is_plain(thing) or isinstance(thing, GENERATORS):
+    if is_plain(thing) or isinstance(thing, GENERATORS):
         yield name, thing
     elif depth < 0:
         return
@@ -304,9 +304,10 @@ def held_by(thing: Any, name: str = "", depth: int = _DEEP) -> Iterator[tuple[st
             yield from held_by(each, f"{name}.{key}" if name else key, depth - 1)
 
 
-def _is_plain(thing: Any) -> bool:
+def is_plain(thing: Any) -> bool:
+    """Whether a thing is made of numbers, texts and arrays."""
     if isinstance(thing, list | tuple | set | dict):
-        return all(map(_is_plain, thing.values() if isinstance(thing, dict) else thing))
+        return all(map(is_plain, thing.values() if isinstance(thing, dict) else thing))
     return thing is None or isinstance(thing, (bool, int, float, complex, str, bytes, np.generic, np.ndarray))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -32,6 +33,7 @@ class Seen:
     """What was seen of an environment."""
 
     env: Env
+    make: Callable[[], Env]  # makes another
     gamma: float
     steps: Steps
     replays: Replays
@@ -94,7 +96,7 @@ class Seen:
         shortly_before = int(np.sum((lengths >= 0.75 * longest) & (lengths < longest)))
         if longest < 3 or len(latest) < max(ENDINGS, shortly_before + 1):
             return None
-        is_limit = steps.terminated[latest].all() and not steps.truncated[latest].any()
+        is_limit = steps.terminated[latest].all()
         is_met_before = np.isin(steps.after[latest], steps.before).mean() > 0.5
         return longest if is_limit and is_met_before and not self._shows_time else None
 

@@ -1,8 +1,7 @@
 """What may be wrong with an environment: a function for each thing to look at, which yields its findings.
 
 `ALL` has them in the order of the page. Each says with numbers what is unusual, and one change to try. Where
-an environment may be sound it is left alone: thresholds are wide, and tests of chance (`hidden`) are
-corrected for their number and need a large effect as well.
+an environment may be sound it is left alone: thresholds are wide.
 """
 
 from __future__ import annotations
@@ -98,13 +97,15 @@ def _ends(seen: Seen) -> Iterator[EnvFinding]:
     steps, lengths, mdp = seen.steps, seen.lengths, seen.mdp
     last = steps.last
     if (limit := seen.ends_at) is not None:
+        cut = steps.truncated[last[lengths == limit]].any()
         yield EnvFinding(
             "termination",
             WARNING,
-            f"{np.sum(lengths == limit)} of {len(lengths)} episodes are terminated=True at step {limit}, "
-            "none later, and the observation does not show the time: this is a step limit, which value "
-            "functions take for the end of the task.",
-            f"return truncated=True at the limit, or use gymnasium.wrappers.TimeLimit(env, {limit}).",
+            f"{np.sum(lengths == limit)} of {len(lengths)} episodes are terminated=True "
+            f"{'and truncated=True ' * bool(cut)}at step {limit}, none later, and the observation does not "
+            "show the time: this is a step limit, which value functions take for the end of the task.",
+            "return terminated=False and truncated=True at the limit, or use "
+            f"gymnasium.wrappers.TimeLimit(env, {limit}).",
         )
     ended, is_long = steps.terminated[last] | steps.truncated[last], (lengths >= LONGEST).any()
     never, how = (

@@ -465,3 +465,108 @@ def test_the_generators_of_a_given_environments_spaces_are_left_as_they_are() ->
     examine(env, steps=200)
     after = [space.np_random.bit_generator.state for space in (env.action_space, env.observation_space)]
     assert before == after
+
+
+class HiddenCell(gym.Env[Any, Any]):
+    """A goal in one of nine cells, drawn at a reset and never shown; to stop there is the only end."""
+
+    action_space = Discrete(5)
+    observation_space = Discrete(9)
+    slip, draws = 0.0, False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Start:
+        super().reset(seed=seed)
+        self.cell, self.goal = 0, int(self.np_random.integers(1, 9))
+        return 0, {}
+
+    def step(self, action: Any) -> Result:
+        if self.draws and self.np_random.random() < self.slip:
+            action = self.np_random.integers(4)
+        row, column = divmod(self.cell, 3)
+        down, right = [(0, -1), (0, 1), (1, 0), (-1, 0), (0, 0)][int(action)]
+        done = int(action) == 4 and self.cell == self.goal
+        self.cell = min(max(row + down, 0), 2) * 3 + min(max(column + right, 0), 2)
+        return self.cell, float(done), done, False, {}
+
+
+class HiddenCellAndADraw(HiddenCell):
+    draws = True
+
+
+class HiddenCellWithSlip(HiddenCellAndADraw):
+    slip = 0.1
+
+
+@pytest.mark.parametrize("env", [HiddenCell, HiddenCellAndADraw, HiddenCellWithSlip])
+def test_a_hidden_goal_is_named_also_where_steps_draw(env: Any) -> None:
+    result = examine(lambda: gym.wrappers.TimeLimit(env(), 50), steps=STEPS)
+    assert "depend on what is drawn at reset (goal), which is not observed" in evidence(result, "markov")
+    assert result.topics == ["markov"]
+    assert "show goal" in result.findings[0].advice
+
+
+class Dirt(gym.Env[Any, Any]):
+    """A vacuum cleaner in a row of cells, of which it does not see which are clean."""
+
+    size = 4
+    action_space = Discrete(3)
+
+    def __init__(self) -> None:
+        self.observation_space = Discrete(self.size)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Start:
+        super().reset(seed=seed)
+        self.place, self.dirt, self.time = 0, [1.0] * self.size, 0
+        return 0, {}
+
+    def step(self, action: Any) -> Result:
+        paid, self.time = 0.0, self.time + 1
+        if action == 2:
+            paid, self.dirt[self.place] = self.dirt[self.place], 0.0
+        else:
+            self.place = min(max(self.place + (1 if action else -1), 0), self.size - 1)
+        return self.place, paid, not any(self.dirt), self.time >= 30, {}
+
+
+class MuchDirt(Dirt):
+    """More than can be enumerated."""
+
+    size = 16
+
+
+@pytest.mark.parametrize(("env", "named"), [(Dirt, " (dirt)"), (MuchDirt, "")])
+def test_what_was_done_long_ago_is_not_called_the_time(env: Any, named: str) -> None:
+    (found,) = examine(env, steps=5_000).findings
+    assert found.topic == "markov"
+    assert f"depend on more of the past than the step before{named}, which" in found.evidence
+    assert "add the time" not in found.advice
+
+
+class BothFlags(Walk):
+    """At its limit it returns both flags."""
+
+    size = 10
+
+    def step(self, action: Any) -> Result:
+        observation, reward, over, cut, info = super().step(action)
+        return observation, reward, over or cut, cut, info
+
+
+def test_a_limit_with_both_flags_is_called_a_limit() -> None:
+    (found,) = examine(BothFlags, steps=5_000).findings
+    assert found.topic == "termination"
+    assert "terminated=True and truncated=True at step 40" in found.evidence
+    assert "terminated=False" in found.advice
+
+
+class Mask(Walk):
+    shape: tuple[int, ...] = (1, 2)
+
+    def action_masks(self) -> Any:
+        return np.ones(self.shape, np.bool_)
+
+
+def test_a_mask_of_one_row_is_a_mask() -> None:
+    result = examine(Mask, steps=STEPS)
+    assert result.passed, str(result)
+    assert "can be reached" in fact(result, "states")
