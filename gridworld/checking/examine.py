@@ -79,8 +79,8 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
     it is estimated.
 
     Args:
-        env: an environment of Gymnasium, which is left as it is; a function or class that makes one, without
-            arguments; or a name: an id of Gymnasium, `module:NAME` of a function or class, or a world of
+        env: an environment of Gymnasium, which is left as it is, or a batch of them in this process, whose
+            first is examined; a function or class that makes one, without arguments; or a name: an id of Gymnasium, `module:NAME` of a function or class, or a world of
             this project, e.g. cliff.
         gamma: the discount that an agent will have.
         steps: how many steps to sample.
@@ -138,6 +138,8 @@ def _subject(env: Any) -> tuple[str, Make, Mdp | None]:
             make_env(env).close()
             return env, lambda: make_env(env), None
         env = named_world(env)
+    if isinstance(batch := getattr(env, "__dict__", {}).get("envs"), list | tuple) and batch:
+        env = batch[0]
     if isinstance(env, Mdp):
         limit, seen = env.max_episode_steps or STEP_LIMIT, make_observation(env, "none")
         return env.name, lambda: SingleEnv(GridWorldVectorEnv(mdp=env, max_episode_steps=limit), seen), env

@@ -18,8 +18,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from gridworld.checking.sampling import held_by, is_plain
 from gridworld.checking.seen import Seen
+from gridworld.world.door.attributes import differing, held_by, is_plain
 from gridworld.world.door.observations import content
 from gridworld.world.door.search import Search, State
 from gridworld.world.mdp import BoolArray, IntArray
@@ -141,7 +141,7 @@ def _names(search: _States, conflicts: dict[bytes, dict[Any, list[int]]]) -> str
         groups = [[_values(search, each) for each in states[:_LOOKED_AT]] for states in found.values()]
         for group, other in combinations(groups[:_LOOKED_AT], 2):
             pairs = [(one, two) for one in group for two in other]
-            differ = [tuple(sorted(name for name in one if one[name] != two.get(name))) for one, two in pairs]
+            differ = [tuple(differing(one, two)) for one, two in pairs]
             counts[min(differ, key=len)] += 1
     least = min((len(each) for each in counts if each), default=0)
     names = max((each for each in counts if len(each) == least), key=lambda each: counts[each], default=())

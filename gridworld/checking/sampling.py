@@ -11,7 +11,6 @@ import copy
 import itertools
 import random
 import time
-import types
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -24,8 +23,11 @@ from gymnasium import spaces
 from gridworld.base.errors import in_short
 from gridworld.world.door.attributes import (
     GENERATORS,
-    attributes,
+    differing,
+    held_by,
     holders_of,
+    innermost,
+    is_plain,
     layers_of,
     own_spaces,
     random_states,
@@ -48,9 +50,7 @@ _MOST_NUMBERS = 256  # of an observation; more, as of an image, are not looked a
 _SECONDS = 15.0  # for the sample
 _REPLAYED = 10.0  # seconds, for the replays; fewer steps where that is not enough
 _ENDED, _TRIES = 3.0, 20  # seconds and episodes, for those that end as some of the sample did
-_DEEP = 4  # objects in objects
 _ITS = "its generator"
-_NOT_HELD = (gym.Env, gym.Space, type, types.ModuleType, types.FunctionType, types.MethodType)
 
 
 @dataclass
@@ -268,11 +268,8 @@ def _survivors(fresh: Env, used: Env) -> list[str]:
             inner.append({name: content(each) for name, each in held_by(env.unwrapped) if is_plain(each)})
     except Exception:  # whatever cannot be copied
         return [""]
-    differ = [name for name in inner[0] | inner[1] if inner[0].get(name) != inner[1].get(name)]
-    names = []
-    for name in sorted(name for name in keys[0] | keys[1] if keys[0].get(name) != keys[1].get(name)):
-        names += [each for each in differ if each.startswith((f"{name}.", f"{name}["))] or [name]
-    return names or [""]
+    names = differing(*keys)
+    return innermost(names, differing(*inner)) or [""]
 
 
 def _play(env: Env, actions: Sequence[Any], seed: int, drawn: set[str], other: str = "") -> Play:
@@ -288,27 +285,6 @@ def _play(env: Env, actions: Sequence[Any], seed: int, drawn: set[str], other: s
             break
     drawn |= {name for (name, each), then in zip(generators, before, strict=True) if _state(each) != then}
     return found
-
-
-def held_by(thing: Any, name: str = "", depth: int = _DEEP) -> Iterator[tuple[str, Any]]:
-    """What an object holds, and what is held there, by their names: robot.place, robots[0].place."""
-    if is_plain(thing) or isinstance(thing, GENERATORS):
-        yield name, thing
-    elif depth < 0:
-        return
-    elif isinstance(thing, list | tuple | dict):
-        for key, each in thing.items() if isinstance(thing, dict) else enumerate(thing):
-            yield from held_by(each, f"{name}[{key!r}]", depth - 1)
-    elif depth == _DEEP or not isinstance(thing, _NOT_HELD):
-        for key, each in attributes(thing).items():
-            yield from held_by(each, f"{name}.{key}" if name else key, depth - 1)
-
-
-def is_plain(thing: Any) -> bool:
-    """Whether a thing is made of numbers, texts and arrays."""
-    if isinstance(thing, list | tuple | set | dict):
-        return all(map(is_plain, thing.values() if isinstance(thing, dict) else thing))
-    return thing is None or isinstance(thing, (bool, int, float, complex, str, bytes, np.generic, np.ndarray))
 
 
 def generators_of(env: Env) -> list[tuple[str, Any]]:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
-from helpers.faulty_envs import Result, Slippery, Start, Walk
+from helpers.faulty_envs import Result, Slippery, Start, Walk, WrongGoal
 from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from gridworld.checking.examine import ExamineResult, examine
 
@@ -455,6 +456,17 @@ def test_what_is_kept_and_what_is_drawn_from_is_named(env: Any, topic: str, word
     result = examine(env, steps=STEPS)
     assert words in evidence(result, topic), str(result)
     assert result.topics == [topic] * bool(topic)
+
+
+def test_a_refusal_to_enumerate_names_the_inner_attribute_too() -> None:
+    assert "same state (in robots[0].looks), so" in fact(examine(Warehouse, steps=200), "states")
+
+
+@pytest.mark.parametrize("batch", [gym.vector.SyncVectorEnv, DummyVecEnv])
+def test_of_a_batch_the_first_environment_is_examined(batch: Any) -> None:
+    result = examine(batch([WrongGoal, WrongGoal]), steps=200)
+    assert result.name == "WrongGoal"
+    assert result.topics == ["reward"]
 
 
 def test_the_generators_of_a_given_environments_spaces_are_left_as_they_are() -> None:

@@ -6,18 +6,19 @@ import enum
 import functools
 import hashlib
 import inspect
+import itertools
 import pickle
 import random
 import sys
 import types
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 _LIBRARIES = ("gymnasium", "numpy", "pygame", "stable_baselines3", "torch", "gridworld")
-_DEEP = 4  # lists in lists
+_DEEP = 4  # lists in lists, objects in objects
 _NOT_PLAIN = (
     *(type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, types.MethodType, property),
     *(classmethod, staticmethod, enum.Enum, gym.Env, gym.Space, np.ndarray, functools.partial),
@@ -42,6 +43,38 @@ def attributes(thing: Any) -> dict[str, Any]:
         except AttributeError:
             continue
     return found
+
+
+def held_by(thing: Any, name: str = "", depth: int = _DEEP) -> Iterator[tuple[str, Any]]:
+    """What an object holds, and what is held there, by their names: robot.place, robots[0].place."""
+    if is_plain(thing) or isinstance(thing, GENERATORS):
+        yield name, thing
+    elif depth < 0:
+        return
+    elif isinstance(thing, list | tuple | dict):
+        for key, each in thing.items() if isinstance(thing, dict) else enumerate(thing):
+            yield from held_by(each, f"{name}[{key!r}]", depth - 1)
+    elif depth == _DEEP or not isinstance(thing, _NOT_PLAIN):
+        for key, each in attributes(thing).items():
+            yield from held_by(each, f"{name}.{key}" if name else key, depth - 1)
+
+
+def is_plain(thing: Any) -> bool:
+    """Whether a thing is made of numbers, texts and arrays."""
+    if isinstance(thing, list | tuple | set | dict):
+        return all(map(is_plain, thing.values() if isinstance(thing, dict) else thing))
+    return thing is None or isinstance(thing, (bool, int, float, complex, str, bytes, np.generic, np.ndarray))
+
+
+def differing(one: Mapping[str, Any], two: Mapping[str, Any]) -> list[str]:
+    """The names with another content in one of these than in the other."""
+    return sorted(name for name in one.keys() | two.keys() if one.get(name) != two.get(name))
+
+
+def innermost(names: Iterable[str], inner: Sequence[str]) -> list[str]:
+    """Names of attributes, or of what is held there, where that is among `inner` names."""
+    found = ([one for one in inner if one.startswith((f"{name}.", f"{name}["))] or [name] for name in names)
+    return list(itertools.chain.from_iterable(found))
 
 
 def set_attributes(thing: Any, held: dict[str, Any]) -> None:

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from gridworld.world.door.attributes import differing, held_by, innermost, is_plain
+from gridworld.world.door.observations import content
+
 if TYPE_CHECKING:
     from gridworld.world.door.search import Search
 
@@ -68,22 +71,28 @@ class Resets:
 
     def _refuse(self, copy: bytes) -> NoReturn:
         usual, found = self._values_after(self._first), self._values_after(copy)
-        changed = sorted(name for name in usual | found if usual.get(name) != found.get(name))
+        outer, inner = (differing(*each) for each in zip(usual, found, strict=True))
+        changed = ", ".join(innermost(outer, inner)) or "nothing"
         raise self._search.refusal(
-            f"a reset does not always lead to the same state (in {', '.join(changed) or 'nothing'}), so its "
+            f"a reset does not always lead to the same state (in {changed}), so its "
             "states cannot be enumerated from one start; set all of it in reset(), or name what does not "
             "matter in env.ignore"
         )
 
-    def _values_after(self, copy: bytes) -> dict[str, set[bytes]]:
+    def _values_after(self, copy: bytes) -> tuple[dict[str, set[bytes]], dict[str, set[bytes]]]:
+        """The contents of attributes, and of what they hold, after all outcomes of a reset."""
         values: dict[str, set[bytes]] = {}
+        inner: dict[str, set[bytes]] = {}
         search = self._search
 
         def reset() -> Any:
             result = search.reset_from(copy)
             for (_, name), value in search.layers.values(search.ignore).items():
                 values.setdefault(name, set()).add(value)
+            for name, held in (each for layer in search.layers.layers for each in held_by(layer)):
+                if is_plain(held):
+                    inner.setdefault(name, set()).add(content(held))
             return result
 
         search.branching.outcomes(reset)
-        return values
+        return values, inner
