@@ -79,9 +79,9 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
     it is estimated.
 
     Args:
-        env: an environment of Gymnasium, which is left as it is, or a batch of them in this process, whose
-            first is examined; a function or class that makes one, without arguments; or a name: an id of Gymnasium, `module:NAME` of a function or class, or a world of
-            this project, e.g. cliff.
+        env: an environment of Gymnasium, which is left as it is, or a batch, whose first is examined; a
+            function or class that makes one, without arguments; or a name: an id of Gymnasium, `module:NAME`
+            of a function or class, or a world of this project, e.g. cliff.
         gamma: the discount that an agent will have.
         steps: how many steps to sample.
         seed: of all that is drawn.
