@@ -233,13 +233,13 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
     at_random = steps.last[steps.at_random[steps.last]]
     if seen.reach is not None:
         likely, away = seen.reach
-        how_often = "every episode" if likely == 1 else f"{_percent(likely)} of its episodes"
+        how_often = "every episode" if likely == 1 else f"{_percent(likely, 3)} of its episodes"
         soonest = f"{away:,} step{'s' * (away > 1)} away at the soonest"
         yield "random policy", f"comes to {seen.worth}, {soonest}, in {how_often} (exact)"
     elif is_usual and seen.paid.any() and len(at_random):
         hits = len(np.unique(steps.episode[steps.at_random & seen.paid]))
         low, high = wilson_interval(hits, len(at_random))
-        interval = f"95 % interval {_percent(low)} to {_percent(high)}"
+        interval = f"95 % interval {_percent(low, 1)} to {_percent(high, 1)}"
         yield (
             "random policy",
             f"comes to {seen.worth} in {hits:,} of {len(at_random):,} episodes ({interval})",
@@ -250,10 +250,10 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
         yield "random policy", f"{found} in {len(at_random):,} sampled episodes"
 
 
-def _percent(share: float) -> str:
-    """A probability with one decimal, or with as many as distinguish it from 0 and from 1."""
-    for decimals in range(1, 13):
-        text = f"{share:.{decimals}%}"
-        if share in (0, 1) or text.strip("0.%") not in ("", "1"):
+def _percent(share: float, decimals: int) -> str:
+    """A probability with so many decimals, or with as many as distinguish it from 0 and from 1."""
+    for each in range(decimals, 13):
+        text = f"{share:.{each}%}"
+        if share in (0, 1) or float(text[:-1]) not in (0, 100):
             return text
     return "less than 1e-12" if share < 0.5 else "more than 99.9999999999%"

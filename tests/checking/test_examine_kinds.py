@@ -53,7 +53,7 @@ class LastChance(Ends):
 @pytest.mark.parametrize("env", [Ends, CostlyEnds])
 def test_only_what_is_called_the_reward_is_counted(env: Any) -> None:
     """By symmetry half of the episodes end on the right; those on the left pay more than a step, too."""
-    assert fact(examine(env, steps=STEPS), "random policy").endswith("in 50.0% of its episodes (exact)")
+    assert fact(examine(env, steps=STEPS), "random policy").endswith("in 50.000% of its episodes (exact)")
 
 
 def test_several_rewards_are_named_by_what_they_are_above() -> None:
@@ -83,6 +83,19 @@ def test_a_probability_is_never_rounded_to_1() -> None:
     assert "5 steps away at the soonest, in every episode" in fact(
         examine(Straight, steps=STEPS), "random policy"
     )
+
+
+class Tenth(Walk):
+    """One draw in ten pays at once, in an episode of one step."""
+
+    size, limit = 2, 1
+
+    def move(self, action: Any) -> None:
+        self.place = int(self.np_random.integers(10) == 0)
+
+
+def test_a_tenth_is_a_tenth() -> None:
+    assert "in 10.000% of its episodes (exact)" in fact(examine(Tenth, steps=STEPS), "random policy")
 
 
 class Fall(Walk):
