@@ -130,14 +130,14 @@ class Actions:
 def generators_restored(env: Any) -> Iterator[None]:
     """Leave the generators that all share, and those of an environment's spaces, as they were."""
     states, layers = (random.getstate(), np.random.get_state()), layers_of(env)
-    own = [(each, each._np_random) for layer in layers for each in spaces_in(own_spaces(layer))]
+    own = [(each, vars(each).get("_np_random")) for layer in layers for each in spaces_in(own_spaces(layer))]
     try:
         yield
     finally:
         random.setstate(states[0])
         np.random.set_state(states[1])
         for space, generator in own:
-            space._np_random = generator
+            vars(space)["_np_random"] = generator
 
 
 def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
