@@ -522,7 +522,25 @@ class HiddenCellWithSlip(HiddenCellAndADraw):
     slip = 0.1
 
 
-@pytest.mark.parametrize("env", [HiddenCell, HiddenCellAndADraw, HiddenCellWithSlip])
+class HiddenCellInTime(HiddenCellWithSlip):
+    """Counts its steps and its episodes, to cut the one and to report the other."""
+
+    steps = episodes = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Start:
+        self.steps, self.episodes = 0, self.episodes + 1
+        return super().reset(seed=seed)
+
+    def step(self, action: int) -> Any:
+        *shown, _, info = super().step(action)
+        self.steps += 1
+        return *shown, self.steps >= 60, info | {"episodes": self.episodes}
+
+
+HIDDEN = [HiddenCell, HiddenCellAndADraw, HiddenCellWithSlip, HiddenCellInTime]
+
+
+@pytest.mark.parametrize("env", HIDDEN)
 def test_a_hidden_goal_is_named_also_where_steps_draw(env: Any) -> None:
     result = examine(lambda: gym.wrappers.TimeLimit(env(), 50), steps=STEPS)
     assert "depend on what is drawn at reset (goal), which is not observed" in evidence(result, "markov")

@@ -17,6 +17,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from gridworld.world.door.unread import Unread
+
 _LIBRARIES = ("gymnasium", "numpy", "pygame", "stable_baselines3", "torch", "gridworld")
 _DEEP = 4  # lists in lists, objects in objects
 _NOT_PLAIN = (
@@ -47,10 +49,10 @@ def attributes(thing: Any) -> dict[str, Any]:
 
 def held_by(thing: Any, name: str = "", depth: int = _DEEP) -> Iterator[tuple[str, Any]]:
     """What an object holds, and what is held there, by their names: robot.place, robots[0].place."""
+    if type(thing) is Unread or depth < 0:
+        return
     if is_plain(thing) or isinstance(thing, GENERATORS):
         yield name, thing
-    elif depth < 0:
-        return
     elif isinstance(thing, list | tuple | dict):
         for key, each in thing.items() if isinstance(thing, dict) else enumerate(thing):
             yield from held_by(each, f"{name}[{key!r}]", depth - 1)
