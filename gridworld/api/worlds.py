@@ -18,9 +18,8 @@ from gridworld.config.compose import named_world
 from gridworld.config.worlds import is_id
 from gridworld.envs.inspection import Task, task_of, world_of
 from gridworld.envs.vector_env import GridWorldVectorEnv
-from gridworld.world.chain import as_numbers, policy_of_table
 from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES
-from gridworld.world.evaluation import Evaluator, PolicySnapshot, Score
+from gridworld.world.evaluation import Evaluator, PolicySnapshot, Score, as_numbers, policy_of_table
 from gridworld.world.mdp import FloatArray, Mdp
 from gridworld.world.sources.environment import make_env
 

@@ -18,8 +18,7 @@ from gridworld.config.fields import Word
 from gridworld.config.train import AgentConfig
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.vector_env import GridWorldVectorEnv
-from gridworld.world.chain import as_numbers, policy_of_table
-from gridworld.world.evaluation import PolicySnapshot
+from gridworld.world.evaluation import PolicySnapshot, as_numbers, policy_of_table
 from gridworld.world.mdp import FloatArray
 
 OBSERVATIONS = {"state": "none", "one_hot": "one_hot"}  # kinds of `envs.observations`

@@ -133,7 +133,7 @@ def proven(evaluator: Evaluator, greedy: IntArray) -> Verified:
     values, best, bounds = evaluator.values(chain), evaluator.solution.v, evaluator.bounds
     candidates: list[tuple[FloatArray, FloatArray]] = []
     if bounds is not None:
-        candidates.append((bounds.upper, bounds.lower(chain, values)))
+        candidates.append((bounds.upper, bounds.bound(values, chain.policy)))
     elif gamma == 1:
         candidates += [(best, values), (np.round(best, _ROUNDED), np.round(values, _ROUNDED))]
     checker, size = _checker(), int(np.count_nonzero(mdp.probability[mdp.reachable]))
@@ -148,7 +148,7 @@ def proven(evaluator: Evaluator, greedy: IntArray) -> Verified:
                 best_worth, worth = checker.check(checker.parsed(json.dumps(found)))
                 exact = best_worth - worth
             else:
-                exact = bounds.regret(lower)
+                exact = bounds.regret(chain.policy, values)
         except ValueError:
             continue
         regret = float(exact) if float(exact) >= exact else math.nextafter(float(exact), math.inf)
@@ -166,7 +166,7 @@ def _certificate(
     entered = np.flatnonzero((steps_from(mdp.start_states, mdp.next_state, taken) >= 0) & live)
     states, steps = np.flatnonzero(live).tolist(), {}
     if gamma == 1 and lower[entered].max(initial=0.0) > 0:
-        ending = (1 + _MORE) * chain.expected_steps()
+        ending = (1 + _MORE) * chain.total((~mdp.absorbing).astype(np.float64), 1.0)
         steps = {str(state): float(ending[state]) for state in entered.tolist()}
     table = [mdp.probability.tolist(), mdp.next_state.tolist(), mdp.reward.tolist()]
     world = {

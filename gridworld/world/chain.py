@@ -100,7 +100,7 @@ class Chain:
         """
         gamma = check_gamma(gamma)
         if gamma > ORDINARY_GAMMA:
-            return self.evaluation(gamma).value
+            return (self.undiscounted if gamma == 1 else self.evaluation(gamma)).value
         states = np.flatnonzero(~self.mdp.absorbing)
         if not isinstance(self.transition, np.ndarray):
             return self._sums(self.reward[:, None], gamma)[:, 0]
@@ -124,6 +124,11 @@ class Chain:
         finite = np.isfinite(sums)
         slopes = self._sums(self.transition @ np.where(finite, sums, 0.0), gamma)
         return Evaluation(*_value_and_scale(sums), *_value_and_scale(np.where(finite, slopes, np.inf)))
+
+    @cached_property
+    def undiscounted(self) -> Evaluation:
+        """The evaluation at γ = 1."""
+        return self.evaluation(1.0)
 
     @in_one_thread()
     def outcome(self, max_steps: int) -> Outcome:
@@ -174,15 +179,11 @@ class Chain:
         """(S,), the expected discounted sum of numbers (S,) of at least 0, one for each state on the way."""
         return self._sums(counted[:, None], gamma)[:, 0]
 
-    def expected_steps(self) -> FloatArray:
-        """(S,), how many steps an episode takes from a state on average; infinite where it may not end."""
-        return self.total((~self.mdp.absorbing).astype(np.float64), 1.0)
-
     def endless_states(self) -> IntArray:
         """(n,), ascending, where an episode may go on for ever: of a deterministic policy its cycle."""
         mdp = self.mdp
         reached = steps_from(mdp.start_states, mdp.next_state, self._taken) >= 0
-        states: IntArray = np.flatnonzero(reached & ~can_reach(mdp, self._taken, mdp.terminal))
+        states: IntArray = np.flatnonzero(reached & (steps_to(mdp, self._taken, mdp.terminal) < 0))
         while True:  # what lies on the way into a cycle has no predecessor here and drops out
             following = np.unique(mdp.next_state[states][self._taken[states]])
             if following.size == states.size:
@@ -200,7 +201,7 @@ class Chain:
             for column, collected in zip(sums.T, right.T, strict=True):
                 paying = np.unique(self._recurrent[(self._recurrent > 0) & (collected > 0)])
                 if paying.size:
-                    column[can_reach(self.mdp, self._taken, np.isin(self._recurrent, paying))] = np.inf
+                    column[steps_to(self.mdp, self._taken, np.isin(self._recurrent, paying)) >= 0] = np.inf
             playing = playing & ~(self._recurrent > 0) & np.isfinite(sums).all(axis=1)
         states = np.flatnonzero(playing)
         if states.size:
@@ -218,7 +219,7 @@ class Chain:
     def _recurrent(self) -> IntArray:
         """(S,), a number from 1 on for each class of states that it never leaves, 0 for all other states."""
         recurrent = np.zeros(self.mdp.num_states, dtype=np.int64)
-        ends = can_reach(self.mdp, self._taken, self.mdp.terminal)
+        ends = steps_to(self.mdp, self._taken, self.mdp.terminal) >= 0
         endless = np.flatnonzero(~self.mdp.absorbing & ~ends)
         if endless.size:
             from scipy.sparse import coo_array
@@ -239,7 +240,7 @@ def stopping_states(chain: Chain, gamma: float) -> BoolArray:
     if gamma < 1:
         return mdp.absorbing
     taken = (chain.policy[:, :, None] > 0) & (mdp.probability > 0)
-    return mdp.absorbing | ~can_reach(mdp, taken, mdp.terminal)
+    return mdp.absorbing | (steps_to(mdp, taken, mdp.terminal) < 0)
 
 
 @in_one_thread()
@@ -296,46 +297,6 @@ def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
         raise InputError(f"policy: row {state} is {table[state].tolist()}, not a probability distribution")
     normalised: FloatArray = table / total
     return normalised
-
-
-def as_numbers(name: str, table: Any, others: str) -> FloatArray:
-    """A table as float64; refuses anything else. Messages call it `name`, and say what `others` it may be."""
-    try:
-        if table is None:  # which numpy takes for NaN
-            raise TypeError
-        return np.asarray(table, dtype=np.float64)
-    except (TypeError, ValueError, RuntimeError):  # torch's, for a tensor with a gradient
-        kind = type(table).__name__
-        raise InputError(f"{name}: {kind} is neither {others} nor a table of numbers") from None
-
-
-def policy_of_table(mdp: Mdp, name: str, numbers: FloatArray, is_q: bool = False) -> FloatArray:
-    """Actions (S,), probabilities (S, A) or Q values (S, A) as a policy (S, A); refuses anything else."""
-    size = mdp.num_states
-    if numbers.shape == (size,) and not is_q:
-        wrong = ~np.isin(numbers, np.arange(mdp.num_actions))
-        if wrong.any():
-            state = int(np.argmax(wrong))
-            raise InputError(
-                f"{name}: state {state} has the action {numbers[state]:g}; must be {mdp.action_choices()}"
-            )
-        return one_hot_policy(numbers.astype(np.int64), mdp.num_actions)
-    if numbers.shape != (size, mdp.num_actions):
-        either = "" if is_q else f"({size},) actions or "
-        raise InputError(
-            f"{name}: has shape {numbers.shape}; {mdp.name} has {size} states and "
-            f"{mdp.num_actions} actions, so it must be {either}({size}, {mdp.num_actions})"
-        )
-    if is_q:
-        return one_hot_policy(numbers.argmax(axis=1), mdp.num_actions)
-    if (numbers < 0).any() or (np.abs(numbers.sum(axis=1) - 1) > 1e-4).any():
-        raise InputError(f"{name}: its rows are not probability distributions; give Q values as q=...")
-    return numbers
-
-
-def can_reach(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> BoolArray:
-    """(S,), from where `targets` (S,) can be reached by the outcomes `taken` (S, A, K)."""
-    return steps_to(mdp, taken, targets) >= 0
 
 
 def steps_to(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> IntArray:

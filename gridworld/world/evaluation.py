@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -104,8 +105,7 @@ class Evaluator:
     @cached_property
     def bounds(self) -> Bounds | None:
         """Proven bounds of what policies are worth; None at a discount of 1."""
-        found, gamma = self.solution, self.solution.gamma
-        return None if gamma == 1 else Bounds(self.mdp, gamma, found.v, self.tolerance / 2)
+        return None if self.solution.gamma == 1 else Bounds(self.mdp, self.solution, self.tolerance / 2)
 
     def optimal_policy(self) -> FloatArray:
         """The policy (S, A) that takes the first of the optimal actions."""
@@ -123,10 +123,10 @@ class Evaluator:
         regret = 0.0 if value == self.optimal_value else self.optimal_value - value  # both may be -inf
         proven, certified = None, regret <= self.tolerance
         if certified and self.bounds is not None:
-            proven = self.bounds.regret(self.bounds.lower(chain, values))
+            proven = self.bounds.regret(chain.policy, values)
             certified = proven <= self.tolerance
         elif certified and not self._earns_nothing:  # nothing bounds what is lost where large rewards cancel
-            lost = np.finfo(np.float64).eps * self._at_start(chain.evaluation(1.0).scale)
+            lost = np.finfo(np.float64).eps * self._at_start(chain.undiscounted.scale)
             certified = max(lost, -regret) <= self.tolerance
         outcome = chain.outcome(self.max_episode_steps)
         return Score(value, regret, certified, outcome, self.mdp.scope, proven)
@@ -175,3 +175,38 @@ def fitting_discounts(judge: Evaluator) -> list[float]:
     usual = _USUAL_DISCOUNTS if judge.mdp.probability.size <= _QUICKLY_SOLVED else ()
     gammas = sorted({*usual, judge.solution.gamma})
     return [gamma for gamma in gammas if score_of_optimum(judge, gamma).certified]
+
+
+def as_numbers(name: str, table: Any, others: str) -> FloatArray:
+    """A table as float64; refuses anything else. Messages call it `name`, and say what `others` it may be."""
+    try:
+        if table is None:  # which numpy takes for NaN
+            raise TypeError
+        return np.asarray(table, dtype=np.float64)
+    except (TypeError, ValueError, RuntimeError):  # torch's, for a tensor with a gradient
+        kind = type(table).__name__
+        raise InputError(f"{name}: {kind} is neither {others} nor a table of numbers") from None
+
+
+def policy_of_table(mdp: Mdp, name: str, numbers: FloatArray, is_q: bool = False) -> FloatArray:
+    """Actions (S,), probabilities (S, A) or Q values (S, A) as a policy (S, A); refuses anything else."""
+    size = mdp.num_states
+    if numbers.shape == (size,) and not is_q:
+        wrong = ~np.isin(numbers, np.arange(mdp.num_actions))
+        if wrong.any():
+            state = int(np.argmax(wrong))
+            raise InputError(
+                f"{name}: state {state} has the action {numbers[state]:g}; must be {mdp.action_choices()}"
+            )
+        return one_hot_policy(numbers.astype(np.int64), mdp.num_actions)
+    if numbers.shape != (size, mdp.num_actions):
+        either = "" if is_q else f"({size},) actions or "
+        raise InputError(
+            f"{name}: has shape {numbers.shape}; {mdp.name} has {size} states and "
+            f"{mdp.num_actions} actions, so it must be {either}({size}, {mdp.num_actions})"
+        )
+    if is_q:
+        return one_hot_policy(numbers.argmax(axis=1), mdp.num_actions)
+    if (numbers < 0).any() or (np.abs(numbers.sum(axis=1) - 1) > 1e-4).any():
+        raise InputError(f"{name}: its rows are not probability distributions; give Q values as q=...")
+    return numbers

@@ -16,19 +16,17 @@ Stability of Numerical Algorithms, 2002, sections 2.1 and 3.1.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from decimal import ROUND_CEILING, Context
-from typing import Any
 
 import numpy as np
 
 from gridworld.world.chain import Chain, one_hot_policy
-from gridworld.world.mdp import FloatArray, IntArray, Mdp
+from gridworld.world.mdp import FloatArray, IntArray, Mdp, steps_from
+from gridworld.world.solver import Solution
 
 _UNIT = 2.0**-53  # of rounding, relative to a number
 _LEAST = 2.0**-1074  # the smallest number, which is more than an underflow loses
-_TRIES, _STEP = 60, 1.5  # of a shift, each so many times as large
-_BETWEEN = 10  # smaller ones are tried, where little is much
+_TRIES = 60  # of a shift
 _ROUNDS = 20  # of policy iteration
 
 
@@ -37,16 +35,15 @@ class Bounds:
 
     Args:
         mdp: the world.
-        gamma: the discount, below 1.
-        values: V* (S,), but for rounding.
+        optimum: its solution, but for rounding, under a discount below 1.
         enough: half of a regret that need not be told from 0.
 
     Attributes:
-        upper: (S,), at least V* in the states that any actions reach, or infinite; 0 where it is over.
+        upper: (S,), the upper bound, see `bound`.
     """
 
-    def __init__(self, mdp: Mdp, gamma: float, values: FloatArray, enough: float) -> None:
-        self._gamma, self._enough = gamma, enough
+    def __init__(self, mdp: Mdp, optimum: Solution, enough: float) -> None:
+        self._mdp, self._gamma, self._enough = mdp, optimum.gamma, enough
         self._live, self._starts = ~mdp.terminal, mdp.start_states
         self._share = mdp.start[self._starts] / mdp.start[self._starts].sum()
         self._states: IntArray = np.flatnonzero(mdp.reachable & self._live)
@@ -54,97 +51,105 @@ class Bounds:
             table[self._states] for table in (mdp.next_state, mdp.reward, mdp.probability)
         )
         self._weight = chance / chance.sum(axis=2, keepdims=True)
-        self._following, self._lost = following, -paid
-        self.upper = self._above(
-            values,
-            lambda actions: Chain(mdp, one_hot_policy(actions, mdp.num_actions)),
-            *(following, paid, self._weight),
-        )
+        self._paid = np.where(chance > 0, paid, 0.0)
+        self._following = np.where(chance > 0, following, self._states[:, None, None])
+        self.upper = self.bound(optimum.v)
+        best = one_hot_policy(optimum.optimal.argmax(axis=1), mdp.num_actions)
+        lower = self.bound(optimum.v, best)
+        self._least_regret = self._at_start(self.upper - lower)
+        # (S, A), where an action is not known to keep to these bounds
+        self._others = np.full_like(optimum.optimal, self._least_regret > 2 * enough)
+        with np.errstate(all="ignore"):
+            self._others[self._states] |= ~(self._rest(lower, -1.0) <= 0)
 
-    def lower(self, chain: Chain, values: FloatArray) -> FloatArray:
-        """Numbers (S,) that are at most V_π in the states that a policy reaches, or -infinite.
-
-        Args:
-            chain: of the policy.
-            values: V_π (S,), but for rounding.
-        """
-        policy, size = chain.policy[self._states], len(self._states)
-        taken = np.arange(size), policy.argmax(axis=1)
-        if (policy[taken] == 1).all():
-            rows = [each[taken][:, None] for each in (self._following, self._lost, self._weight)]
-        else:
-            weight = policy[:, :, None] * self._weight
-            rows = [each.reshape(size, 1, -1) for each in (self._following, self._lost, weight)]
-        return -self._above(-values, lambda actions: chain, *rows)
-
-    def regret(self, lower: FloatArray) -> float:
-        """The regret from the start distribution that a policy with this lower bound (S,) has at most."""
-        return self._at_start(self.upper - lower)
+    def regret(self, policy: FloatArray, values: FloatArray) -> float:
+        """The regret from the start that a policy (S, A) with these values (S,) has at most."""
+        mdp, first = self._mdp, (np.arange(len(policy)), policy.argmax(axis=1))
+        others = self._others[first] | (policy[first] < 1)
+        if others.any():  # then it matters where the policy goes
+            following, possible = mdp.next_state[first][:, None], mdp.probability[first][:, None] > 0
+            if (steps_from(self._starts, following, possible)[others] >= 0).any():
+                return self._at_start(self.upper - self.bound(values, policy))
+        return self._least_regret
 
     def _at_start(self, gap: FloatArray) -> float:
         """Not less than the mean of a gap (S,) between two bounds, each of which was rounded once."""
         here, size = gap[self._starts], len(self._starts)
         return float(here @ self._share) * (1 + (2 * size + 8) * _UNIT) + size * _LEAST * bool(here.any())
 
-    def _above(self, given: FloatArray, chain_of: Callable[[IntArray], Chain], *rows: Any) -> FloatArray:
-        """x (S,) with x ≥ max_b T_b x, near to its fixed point `given`; see `_rest` for the rows.
+    def bound(self, given: FloatArray, policy: FloatArray | None = None) -> FloatArray:
+        """Numbers (S,) that are at least V* where any actions lead, or of a policy at most V_π where it goes.
 
-        `chain_of` makes the chain that follows one row (S,) in each state.
+        Args:
+            given: these values (S,), but for rounding.
+            policy: (S, A), its action probabilities; None: bound V*.
+
+        Returns:
+            numbers near to `given`, or infinite ones; 0 where it is over.
         """
+        sign = 1.0 if policy is None else -1.0
         given = np.where(self._live, given, 0.0)
         with np.errstate(all="ignore"):  # what is too large or too small has no bound
-            large, paid = (np.abs(each).max(initial=0.0) for each in (given[self._states], rows[1]))
-            before = 0.0
-            for number in range(_TRIES):
-                shift = _STEP**number * 2 * _UNIT * (large + paid * (number > 0)) / (1 - self._gamma)
-                found = self._shifted(given, shift)
-                if (self._rest(found, *rows) <= 0).all():
+            shift = 2 * _UNIT * np.abs(given[self._states]).max(initial=0.0) / (1 - self._gamma)
+            for _ in range(_TRIES):
+                found = self._shifted(given, sign * shift)
+                most = self._excess(self._rest(found, sign), policy).max(initial=0.0)
+                if most <= 0:
                     break
-                before = shift
+                shift = 1.1 * shift + 1.5 * most / (1 - self._gamma)
             else:
-                return np.where(self._live, np.inf, 0.0)
-            if self._at_start(found - given) <= self._enough:
+                return np.where(self._live, sign * np.inf, 0.0)
+            if self._at_start(np.abs(found - given)) <= self._enough:
                 return found
-            between = (self._shifted(given, each) for each in np.linspace(before, shift, _BETWEEN))
-            found = next((each for each in between if (self._rest(each, *rows) <= 0).all()), found)
-            return self._nearer(given, found, chain_of, *rows)
+            return self._nearer(given, found, policy, sign)
 
     def _shifted(self, given: FloatArray, shift: float) -> FloatArray:
-        return np.where(self._live, np.nextafter(given + shift, np.inf), 0.0) if shift else given
+        return np.where(self._live, np.nextafter(given + shift, shift * np.inf), 0.0) if shift else given
 
     def _nearer(
-        self, given: FloatArray, found: FloatArray, chain_of: Callable[[IntArray], Chain], *rows: Any
+        self, given: FloatArray, found: FloatArray, policy: FloatArray | None, sign: float
     ) -> FloatArray:
         """The same, by each state's own rounding and what follows, where that of all states is too much.
 
         What adds up is largest by some rows, which policy iteration finds.
         """
-        rest = self._rest(given, *rows)
+        rest = self._rest(given, sign)
+        lacking = 2 * np.maximum(self._excess(rest, policy), 0.0)
         chosen: IntArray = np.zeros(len(given), dtype=np.int64)
         chosen[self._states] = rest.argmax(axis=1)
         for times in (4, 16, 64):
             own = times * _UNIT * np.abs(given)
-            own[self._states] += 2 * np.maximum(rest.max(axis=1), 0.0)
+            own[self._states] += lacking
             for _ in range(_ROUNDS):
-                nearer = given + chain_of(chosen).total(own, self._gamma)
-                nearer = np.where(self._live & (nearer != given), np.nextafter(nearer, np.inf), nearer)
-                off = self._rest(nearer, *rows)
-                if (off <= 0).all():
+                follow = one_hot_policy(chosen, self._mdp.num_actions) if policy is None else policy
+                nearer = given + sign * Chain(self._mdp, follow).total(own, self._gamma)
+                nearer = np.where(self._live & (nearer != given), np.nextafter(nearer, sign * np.inf), nearer)
+                rest = self._rest(nearer, sign)
+                excess = self._excess(rest, policy)
+                if (excess <= 0).all():
                     return nearer
-                chosen[self._states] = np.where(off.max(axis=1) > 0, off.argmax(axis=1), chosen[self._states])
+                chosen[self._states] = np.where(excess > 0, rest.argmax(axis=1), chosen[self._states])
         return found
 
-    def _rest(self, x: FloatArray, following: IntArray, paid: FloatArray, weight: FloatArray) -> FloatArray:
-        """Not less than d (n, B) of numbers x (S,), for rows of outcomes (n, B, K) in the live states."""
-        here = x[self._states][:, None, None]
-        moved, faded = self._gamma * (x[following] - here), (1 - self._gamma) * here
-        total = (weight * (paid + moved - faded)).sum(axis=2)
-        size = (weight * (np.abs(paid) + np.abs(moved) + np.abs(faded))).sum(axis=2)
-        count = weight.shape[2]
-        is_more = (weight > 0) & ((paid != 0) | (here != 0) | (x[following] != 0))  # else nothing is lost
-        lost = 8 * (count + 1) * _LEAST * is_more.any(axis=2)
-        rest: FloatArray = total + size * (1.01 * (2 * count + 8) * _UNIT) + lost
-        return rest
+    def _excess(self, rest: FloatArray, policy: FloatArray | None) -> FloatArray:
+        """(n,), not less than what a `_rest` (n, A) has at most, or of a policy (S, A) on average."""
+        if policy is None:
+            return np.asarray(rest.max(axis=1))
+        chance = policy[self._states]
+        parts, count = chance * rest, rest.shape[1]
+        lost = count * _LEAST * ((rest != 0) & (chance > 0) & (chance < 1)).any(axis=1)
+        return np.asarray(parts.sum(axis=1) + 2 * count * _UNIT * np.abs(parts).sum(axis=1) + lost)
+
+    def _rest(self, x: FloatArray, sign: float) -> FloatArray:
+        """Not less than ± d (n, A) of numbers x (S,) in the live states."""
+        here, there = x[self._states][:, None, None], x[self._following]
+        moved, faded = self._gamma * (there - here), (1 - self._gamma) * here
+        total = (self._weight * (self._paid + moved - faded)).sum(axis=2)
+        size = (self._weight * (np.abs(self._paid) + np.abs(moved) + np.abs(faded))).sum(axis=2)
+        spread = np.abs(self._paid) + np.abs(here) + np.abs(there)  # where all are 0, nothing is lost
+        lost, count = (spread + (spread > 0)).sum(axis=2), self._weight.shape[2]
+        error = 1.01 * (2 * count + 8) * _UNIT * size + 8 * (count + 1) * _LEAST * lost
+        return np.asarray(sign * total + error)
 
 
 def at_most(number: float) -> str:
