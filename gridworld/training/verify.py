@@ -133,7 +133,7 @@ def proven(evaluator: Evaluator, greedy: IntArray) -> Verified:
     values, best, bounds = evaluator.values(chain), evaluator.solution.v, evaluator.bounds
     candidates: list[tuple[FloatArray, FloatArray]] = []
     if bounds is not None:
-        candidates.append((bounds.upper, bounds.bound(values, chain.policy)))
+        candidates.append((bounds.upper, bounds.lower(chain.policy, values)))
     elif gamma == 1:
         candidates += [(best, values), (np.round(best, _ROUNDED), np.round(values, _ROUNDED))]
     checker, size = _checker(), int(np.count_nonzero(mdp.probability[mdp.reachable]))

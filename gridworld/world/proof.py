@@ -53,92 +53,99 @@ class Bounds:
         self._weight = chance / chance.sum(axis=2, keepdims=True)
         self._paid = np.where(chance > 0, paid, 0.0)
         self._following = np.where(chance > 0, following, self._states[:, None, None])
-        self.upper = self.bound(optimum.v)
-        best = one_hot_policy(optimum.optimal.argmax(axis=1), mdp.num_actions)
-        lower = self.bound(optimum.v, best)
+        self.upper = self._bound(optimum.v, 1.0)
+        lower = self._bound(optimum.v, -1.0)
         self._least_regret = self._at_start(self.upper - lower)
+        self._kept = self._starts, np.zeros(0)  # where a policy that keeps to these bounds goes, and how
         # (S, A), where an action is not known to keep to these bounds
         self._others = np.full_like(optimum.optimal, self._least_regret > 2 * enough)
         with np.errstate(all="ignore"):
             self._others[self._states] |= ~(self._rest(lower, -1.0) <= 0)
 
     def regret(self, policy: FloatArray, values: FloatArray) -> float:
-        """The regret from the start that a policy (S, A) with these values (S,) has at most."""
-        mdp, first = self._mdp, (np.arange(len(policy)), policy.argmax(axis=1))
-        others = self._others[first] | (policy[first] < 1)
+        """The regret from the start that a policy (S, A) has at most; see `lower`."""
+        where, how = self._kept
+        if np.array_equal(policy[where], how):
+            return self._least_regret
+        others = (policy > 0) & self._others
         if others.any():  # then it matters where the policy goes
-            following, possible = mdp.next_state[first][:, None], mdp.probability[first][:, None] > 0
-            if (steps_from(self._starts, following, possible)[others] >= 0).any():
-                return self._at_start(self.upper - self.bound(values, policy))
+            taken = (policy > 0)[:, :, None] & (self._mdp.probability > 0)
+            reached = steps_from(self._starts, self._mdp.next_state, taken) >= 0
+            if others[reached].any():
+                return self._at_start(self.upper - self.lower(policy, values))
+            where = np.flatnonzero(reached & self._live)
+            self._kept = where, policy[where]
         return self._least_regret
+
+    def lower(self, policy: FloatArray, values: FloatArray) -> FloatArray:
+        """Numbers (S,) that are at most V_π in the states that a policy reaches, or -infinite.
+
+        Args:
+            policy: (S, A), its action probabilities.
+            values: V_π (S,), but for rounding.
+        """
+        return self._bound(values, -1.0, policy)
 
     def _at_start(self, gap: FloatArray) -> float:
         """Not less than the mean of a gap (S,) between two bounds, each of which was rounded once."""
         here, size = gap[self._starts], len(self._starts)
         return float(here @ self._share) * (1 + (2 * size + 8) * _UNIT) + size * _LEAST * bool(here.any())
 
-    def bound(self, given: FloatArray, policy: FloatArray | None = None) -> FloatArray:
-        """Numbers (S,) that are at least V* where any actions lead, or of a policy at most V_π where it goes.
+    def _bound(self, given: FloatArray, sign: float, policy: FloatArray | None = None) -> FloatArray:
+        """x (S,) near to `given`, for sign 1 with x ≥ T_a x of all actions, for -1 with x ≤ T_a x of some.
 
-        Args:
-            given: these values (S,), but for rounding.
-            policy: (S, A), its action probabilities; None: bound V*.
-
-        Returns:
-            numbers near to `given`, or infinite ones; 0 where it is over.
+        Of a policy, x ≤ T_π x.
         """
-        sign = 1.0 if policy is None else -1.0
         given = np.where(self._live, given, 0.0)
         with np.errstate(all="ignore"):  # what is too large or too small has no bound
             shift = 2 * _UNIT * np.abs(given[self._states]).max(initial=0.0) / (1 - self._gamma)
             for _ in range(_TRIES):
-                found = self._shifted(given, sign * shift)
-                most = self._excess(self._rest(found, sign), policy).max(initial=0.0)
+                found = self._moved(given, sign * shift)
+                most = self._excess(found, sign, policy)[0].max(initial=0.0)
                 if most <= 0:
                     break
                 shift = 1.1 * shift + 1.5 * most / (1 - self._gamma)
             else:
                 return np.where(self._live, sign * np.inf, 0.0)
-            if self._at_start(np.abs(found - given)) <= self._enough:
-                return found
-            return self._nearer(given, found, policy, sign)
+            return found if shift <= self._enough else self._nearer(given, found, sign, policy)
 
-    def _shifted(self, given: FloatArray, shift: float) -> FloatArray:
-        return np.where(self._live, np.nextafter(given + shift, shift * np.inf), 0.0) if shift else given
+    def _moved(self, given: FloatArray, shift: FloatArray | float) -> FloatArray:
+        moved = np.nextafter(given + shift, shift * np.inf)
+        return np.where(self._live & (shift != 0), moved, given)
 
     def _nearer(
-        self, given: FloatArray, found: FloatArray, policy: FloatArray | None, sign: float
+        self, given: FloatArray, found: FloatArray, sign: float, policy: FloatArray | None
     ) -> FloatArray:
         """The same, by each state's own rounding and what follows, where that of all states is too much.
 
         What adds up is largest by some rows, which policy iteration finds.
         """
-        rest = self._rest(given, sign)
-        lacking = 2 * np.maximum(self._excess(rest, policy), 0.0)
-        chosen: IntArray = np.zeros(len(given), dtype=np.int64)
-        chosen[self._states] = rest.argmax(axis=1)
+        excess, chosen = self._excess(given, sign, policy)
+        lacking = 2 * np.maximum(excess, 0.0)
+        actions: IntArray = np.zeros(len(given), dtype=np.int64)
+        actions[self._states] = chosen
         for times in (4, 16, 64):
             own = times * _UNIT * np.abs(given)
             own[self._states] += lacking
             for _ in range(_ROUNDS):
-                follow = one_hot_policy(chosen, self._mdp.num_actions) if policy is None else policy
-                nearer = given + sign * Chain(self._mdp, follow).total(own, self._gamma)
-                nearer = np.where(self._live & (nearer != given), np.nextafter(nearer, sign * np.inf), nearer)
-                rest = self._rest(nearer, sign)
-                excess = self._excess(rest, policy)
+                follow = one_hot_policy(actions, self._mdp.num_actions) if policy is None else policy
+                nearer = self._moved(given, sign * Chain(self._mdp, follow).total(own, self._gamma))
+                excess, chosen = self._excess(nearer, sign, policy)
                 if (excess <= 0).all():
                     return nearer
-                chosen[self._states] = np.where(excess > 0, rest.argmax(axis=1), chosen[self._states])
+                actions[self._states] = np.where(excess > 0, chosen, actions[self._states])
         return found
 
-    def _excess(self, rest: FloatArray, policy: FloatArray | None) -> FloatArray:
-        """(n,), not less than what a `_rest` (n, A) has at most, or of a policy (S, A) on average."""
+    def _excess(self, x: FloatArray, sign: float, policy: FloatArray | None) -> tuple[FloatArray, IntArray]:
+        """(n,), not less than ± d of the actions that matter, (n,), or of a policy (S, A) on average."""
+        rest = self._rest(x, sign)
+        chosen = (sign * rest).argmax(axis=1)
         if policy is None:
-            return np.asarray(rest.max(axis=1))
+            return rest[np.arange(len(rest)), chosen], chosen
         chance = policy[self._states]
         parts, count = chance * rest, rest.shape[1]
         lost = count * _LEAST * ((rest != 0) & (chance > 0) & (chance < 1)).any(axis=1)
-        return np.asarray(parts.sum(axis=1) + 2 * count * _UNIT * np.abs(parts).sum(axis=1) + lost)
+        return parts.sum(axis=1) + 2 * count * _UNIT * np.abs(parts).sum(axis=1) + lost, chosen
 
     def _rest(self, x: FloatArray, sign: float) -> FloatArray:
         """Not less than ± d (n, A) of numbers x (S,) in the live states."""
