@@ -30,9 +30,9 @@ def main(arguments: Sequence[str]) -> None:
     folders, problems = find_runs(options.runs)
     if problems:
         raise InputError(problems[0])
-    if options.out is not None and len(folders) > 1:
-        raise InputError(f"--out {options.out}: is for one run, and there are {len(folders)}")
     if options.out is not None:
+        if len(folders) > 1:
+            raise InputError(f"--out {options.out}: is for one run, and there are {len(folders)}")
         check_file(options.out)
     proofs, mistakes = list[tuple[Verified, bool]](), 0
     for folder in folders:

@@ -6,12 +6,14 @@ checks it, `scripts/check_certificate.py`, imports nothing of this package and c
 
 from __future__ import annotations
 
+import contextlib
 import gzip
-import importlib.util
 import json
 import math
 import os
 from dataclasses import dataclass, field
+from importlib.machinery import ModuleSpec, SourceFileLoader
+from importlib.util import module_from_spec
 from os import PathLike
 from pathlib import Path
 from types import ModuleType
@@ -28,7 +30,7 @@ from gridworld.run.folder import check_writable
 from gridworld.training.saved_run import SavedRun
 from gridworld.world.chain import Chain, one_hot_policy
 from gridworld.world.evaluation import Evaluator, PolicySnapshot
-from gridworld.world.mdp import FloatArray, IntArray, Mdp, steps_from
+from gridworld.world.mdp import FloatArray, IntArray, steps_from
 from gridworld.world.proof import at_most
 
 _MOST_EXACT = 1_000_000  # outcomes of all rows: about half a minute in fractions
@@ -81,20 +83,19 @@ class Verified:
 def check_file(path: Path) -> None:
     """Refuse a place where no certificate can be written, or where something else is than an older one."""
     try:
+        os.fsencode(path)
         if not path.absolute().parent.is_dir():
             raise InputError(f"{path}: there is no folder {path.parent}")
         check_writable(path.absolute().parent, "file")
-        if path.is_symlink() or path.exists():
-            other = f"{path}: is there and not a certificate; choose a new file"
-            if path.is_symlink() or not path.is_file():
-                raise InputError(other)
+        begins = b"" if os.path.lexists(path) else _BEGINS
+        if path.is_file() and not path.is_symlink():
             with (gzip.open if path.name.endswith(".gz") else open)(path, "rb") as file:
-                if file.read(len(_BEGINS)) != _BEGINS:
-                    raise InputError(other)
-        os.fsencode(path)
+                begins = file.read(len(_BEGINS))
+        if begins != _BEGINS:
+            raise InputError(f"{path}: is there and not a certificate; choose a new file")
+    except InputError:
+        raise
     except (OSError, EOFError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{printable(str(path)[:80])}: cannot be written: {reason(error)}") from None
 
 
@@ -128,46 +129,44 @@ def verify(run: Any, out: str | PathLike[str] | None = None, *, best: bool = Fal
 
 def proven(evaluator: Evaluator, greedy: IntArray) -> Verified:
     """What can be proven of the policy that takes these actions (S,)."""
-    mdp, gamma = evaluator.mdp, evaluator.solution.gamma
+    mdp, bounds, best = evaluator.mdp, evaluator.bounds, evaluator.solution.v
     chain = Chain(mdp, one_hot_policy(greedy, mdp.num_actions))
-    values, best, bounds = evaluator.values(chain), evaluator.solution.v, evaluator.bounds
-    candidates: list[tuple[FloatArray, FloatArray]] = []
+    values = evaluator.values(chain)
     if bounds is not None:
-        candidates.append((bounds.upper, bounds.lower(chain.policy, values)))
-    elif gamma == 1:
-        candidates += [(best, values), (np.round(best, _ROUNDED), np.round(values, _ROUNDED))]
-    checker, size = _checker(), int(np.count_nonzero(mdp.probability[mdp.reachable]))
-    is_exact = bounds is None or size <= _MOST_EXACT
+        candidates = [(bounds.upper, bounds.lower(chain.policy, values))]
+    else:
+        candidates = [(best, values), (np.round(best, _ROUNDED), np.round(values, _ROUNDED))]
+        optimum, live = Chain(mdp, evaluator.optimal_policy()), (~mdp.absorbing).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # what may never end has no bound
+            rounding = 8 * np.finfo(np.float64).eps * np.abs(best[mdp.reachable]).max()
+            above, below = (rounding * each.total(live, 1.0) for each in (optimum, chain))
+            candidates.append((best + above, values - below))
+    checker, size = _checker(), np.count_nonzero(mdp.probability[mdp.reachable])
     for upper, lower in candidates:
-        if not (np.isfinite(upper[mdp.reachable]).all() and np.isfinite(lower[mdp.reachable]).all()):
+        if not np.isfinite([upper, lower])[:, mdp.reachable].all():
             continue
-        found = _certificate(mdp, gamma, chain, greedy, upper, lower)
+        found = _certificate(evaluator, chain, upper, lower)
         found["digest"] = checker.digest_of(found)
-        try:
-            if bounds is None or is_exact:
-                best_worth, worth = checker.check(checker.parsed(json.dumps(found)))
-                exact = best_worth - worth
-            else:
-                exact = bounds.regret(chain.policy, values)
-        except ValueError:
-            continue
-        regret = float(exact) if float(exact) >= exact else math.nextafter(float(exact), math.inf)
-        return Verified(regret, regret <= float(evaluator.tolerance), is_exact, found)
+        if bounds is not None and size > _MOST_EXACT:
+            regret = bounds.at_start(upper - lower)
+            return Verified(regret, regret <= evaluator.tolerance, is_exact=False, certificate=found)
+        with contextlib.suppress(ValueError):
+            most, least = checker.check(checker.parsed(json.dumps(found)))
+            regret = checker.outwards(most - least, math.inf)
+            return Verified(regret, regret <= evaluator.tolerance, is_exact=True, certificate=found)
     return Verified(math.inf, is_optimal=False, is_exact=False, certificate={})
 
 
-def _certificate(
-    mdp: Mdp, gamma: float, chain: Chain, greedy: IntArray, upper: FloatArray, lower: FloatArray
-) -> dict[str, Any]:
+def _certificate(evaluator: Evaluator, chain: Chain, upper: FloatArray, lower: FloatArray) -> dict[str, Any]:
     """The content of a certificate, without its digest."""
-    possible = mdp.probability > 0
-    taken = possible & (chain.policy > 0)[:, :, None]
+    mdp, gamma, steps = evaluator.mdp, evaluator.solution.gamma, {}
+    taken = (mdp.probability > 0) & (chain.policy > 0)[:, :, None]
     live = mdp.reachable & ~mdp.terminal
-    entered = np.flatnonzero((steps_from(mdp.start_states, mdp.next_state, taken) >= 0) & live)
-    states, steps = np.flatnonzero(live).tolist(), {}
+    entered = np.flatnonzero((steps_from(mdp.start_states, mdp.next_state, taken) >= 0) & live).tolist()
+    states = np.flatnonzero(live).tolist()
     if gamma == 1 and lower[entered].max(initial=0.0) > 0:
         ending = (1 + _MORE) * chain.total((~mdp.absorbing).astype(np.float64), 1.0)
-        steps = {str(state): float(ending[state]) for state in entered.tolist()}
+        steps = {str(state): float(ending[state]) for state in entered}
     table = [mdp.probability.tolist(), mdp.next_state.tolist(), mdp.reward.tolist()]
     world = {
         str(state): [
@@ -183,9 +182,9 @@ def _certificate(
         "start": [[state, float(mdp.start[state])] for state in mdp.start_states.tolist()],
         "ended": np.flatnonzero(mdp.reachable & mdp.terminal).tolist(),
         "world": world,
-        "policy": {str(state): int(greedy[state]) for state in entered.tolist()},
+        "policy": {str(state): int(chain.policy[state].argmax()) for state in entered},
         "upper": {str(state): float(upper[state]) for state in states},
-        "lower": {str(state): float(lower[state]) for state in entered.tolist()},
+        "lower": {str(state): float(lower[state]) for state in entered},
         "steps": steps,
     }
 
@@ -194,10 +193,7 @@ def _checker() -> ModuleType:
     """`check_certificate.py`, which is no part of the package: beside an installed one, or in `scripts/`."""
     around = Path(gridworld.__file__).parents[1]
     places = (around / "gridworld_check_certificate.py", around / "scripts" / "check_certificate.py")
-    place = next(each for each in places if each.exists())
-    spec = importlib.util.spec_from_file_location("check_certificate", place)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    loader = SourceFileLoader("check_certificate", str(next(each for each in places if each.exists())))
+    module = module_from_spec(ModuleSpec(loader.name, loader))
+    loader.exec_module(module)
     return module

@@ -55,7 +55,7 @@ class Bounds:
         self._following = np.where(chance > 0, following, self._states[:, None, None])
         self.upper = self._bound(optimum.v, 1.0)
         lower = self._bound(optimum.v, -1.0)
-        self._least_regret = self._at_start(self.upper - lower)
+        self._least_regret = self.at_start(self.upper - lower)
         self._kept = self._starts, np.zeros(0)  # where a policy that keeps to these bounds goes, and how
         # (S, A), where an action is not known to keep to these bounds
         self._others = np.full_like(optimum.optimal, self._least_regret > 2 * enough)
@@ -72,7 +72,7 @@ class Bounds:
             taken = (policy > 0)[:, :, None] & (self._mdp.probability > 0)
             reached = steps_from(self._starts, self._mdp.next_state, taken) >= 0
             if others[reached].any():
-                return self._at_start(self.upper - self.lower(policy, values))
+                return self.at_start(self.upper - self.lower(policy, values))
             where = np.flatnonzero(reached & self._live)
             self._kept = where, policy[where]
         return self._least_regret
@@ -86,7 +86,7 @@ class Bounds:
         """
         return self._bound(values, -1.0, policy)
 
-    def _at_start(self, gap: FloatArray) -> float:
+    def at_start(self, gap: FloatArray) -> float:
         """Not less than the mean of a gap (S,) between two bounds, each of which was rounded once."""
         here, size = gap[self._starts], len(self._starts)
         return float(here @ self._share) * (1 + (2 * size + 8) * _UNIT) + size * _LEAST * bool(here.any())

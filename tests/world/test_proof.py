@@ -172,6 +172,15 @@ def test_what_never_ends_is_not_proven_by_the_inequalities_alone() -> None:
     assert proven(classic, standing).regret >= 1.0
 
 
+@pytest.mark.parametrize("name", ["aima_4x3", "deep_sea"])
+def test_without_a_discount_bounds_leave_room_for_the_rounding_of_each_step(name: str) -> None:
+    evaluator = Evaluator(gridworld.compile_env(name), 1.0, 100)
+    found = proven(evaluator, evaluator.solution.optimal.argmax(axis=1))
+    assert found.is_optimal
+    assert found.is_exact
+    assert 0 < found.regret < 1e-12
+
+
 def test_a_bound_is_rounded_up() -> None:
     assert [at_most(each) for each in (1.71e-13, 2.0, 0.0, 99.4, 5e-324)] == [
         *("1.8e-13", "2", "0", "1.0e+2", "5.0e-324")
