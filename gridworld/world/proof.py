@@ -53,8 +53,9 @@ class Bounds:
         self._weight = chance / chance.sum(axis=2, keepdims=True)
         self._paid = np.where(chance > 0, paid, 0.0)
         self._following = np.where(chance > 0, following, self._states[:, None, None])
-        self.upper = self._bound(optimum.v, 1.0)
-        lower = self._bound(optimum.v, -1.0)
+        self.upper = self._bound(optimum.v, None)
+        best = one_hot_policy(optimum.optimal.argmax(axis=1), mdp.num_actions)
+        lower = self.lower(best, optimum.v)
         self._least_regret = self.at_start(self.upper - lower)
         self._kept = self._starts, np.zeros(0)  # where a policy that keeps to these bounds goes, and how
         # (S, A), where an action is not known to keep to these bounds
@@ -84,18 +85,16 @@ class Bounds:
             policy: (S, A), its action probabilities.
             values: V_π (S,), but for rounding.
         """
-        return self._bound(values, -1.0, policy)
+        return self._bound(values, policy)
 
     def at_start(self, gap: FloatArray) -> float:
         """Not less than the mean of a gap (S,) between two bounds, each of which was rounded once."""
         here, size = gap[self._starts], len(self._starts)
         return float(here @ self._share) * (1 + (2 * size + 8) * _UNIT) + size * _LEAST * bool(here.any())
 
-    def _bound(self, given: FloatArray, sign: float, policy: FloatArray | None = None) -> FloatArray:
-        """x (S,) near to `given`, for sign 1 with x ≥ T_a x of all actions, for -1 with x ≤ T_a x of some.
-
-        Of a policy, x ≤ T_π x.
-        """
+    def _bound(self, given: FloatArray, policy: FloatArray | None) -> FloatArray:
+        """x (S,) near to `given` with x ≥ max_a T_a x, or of a policy (S, A) with x ≤ T_π x."""
+        sign = 1.0 if policy is None else -1.0
         given = np.where(self._live, given, 0.0)
         with np.errstate(all="ignore"):  # what is too large or too small has no bound
             shift = 2 * _UNIT * np.abs(given[self._states]).max(initial=0.0) / (1 - self._gamma)
@@ -137,9 +136,9 @@ class Bounds:
         return found
 
     def _excess(self, x: FloatArray, sign: float, policy: FloatArray | None) -> tuple[FloatArray, IntArray]:
-        """(n,), not less than ± d of the actions that matter, (n,), or of a policy (S, A) on average."""
+        """(n,), not less than the largest d, of actions (n,), or - d of a policy (S, A) on average."""
         rest = self._rest(x, sign)
-        chosen = (sign * rest).argmax(axis=1)
+        chosen = rest.argmax(axis=1)
         if policy is None:
             return rest[np.arange(len(rest)), chosen], chosen
         chance = policy[self._states]
