@@ -523,7 +523,7 @@ class HiddenCellWithSlip(HiddenCellAndADraw):
 
 
 class HiddenCellInTime(HiddenCellWithSlip):
-    """Counts its steps and its episodes, to cut the one and to report the other."""
+    """Counts its episodes, and its steps to cut them."""
 
     steps = episodes = 0
 
@@ -534,7 +534,7 @@ class HiddenCellInTime(HiddenCellWithSlip):
     def step(self, action: int) -> Any:
         *shown, _, info = super().step(action)
         self.steps += 1
-        return *shown, self.steps >= 60, info | {"episodes": self.episodes}
+        return *shown, self.steps >= 60, info
 
 
 HIDDEN = [HiddenCell, HiddenCellAndADraw, HiddenCellWithSlip, HiddenCellInTime]
