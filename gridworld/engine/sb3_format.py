@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+import cloudpickle
 import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -112,8 +113,12 @@ def put_weights(run: Run) -> None:
         }
 
 
-def model_file(run: Run) -> bytes:
-    put_weights(run)
+def model_file(model: BaseAlgorithm, exclude: Sequence[str] = ()) -> bytes:
+    """SB3's own file of a model, which holds classes of this package by value: SB3 reads it without them."""
     content = io.BytesIO()
-    run.model.save(content, exclude=["rollout_buffer_class", "replay_buffer_class", "replay_buffer_kwargs"])
+    cloudpickle.register_pickle_by_value(gridworld)
+    try:
+        model.save(content, exclude=exclude)
+    finally:
+        cloudpickle.unregister_pickle_by_value(gridworld)
     return content.getvalue()

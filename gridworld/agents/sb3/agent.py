@@ -196,9 +196,7 @@ class SB3Agent(Agent):
         return PolicySnapshot(greedy, explored(one_hot_policy(greedy, q.shape[1]), epsilon), values, q)
 
     def model_file(self) -> bytes:
-        content = io.BytesIO()
-        self._model.save(content, exclude=["_last_original_obs"])  # which SB3 sets before it reads it
-        return content.getvalue()
+        return model_file(self._model, ["_last_original_obs"])  # which SB3 sets before it reads it
 
     def load(self, path: Path) -> None:
         """See `gridworld.agents.Agent.load`: nothing in the file is unpickled as SB3 would, or run."""
@@ -251,7 +249,8 @@ class EngineAgent(SB3Agent):
             return self._model
         file = io.BytesIO(self.model_file())
         envs = GridWorldVecEnv(self._envs, self.observation, self.config.reward_factor)
-        return type(self._model).load(file, env=envs, device=self._model.device)
+        own = {"policy_kwargs": self._model.policy_kwargs.copy()}  # with this process's classes
+        return type(self._model).load(file, env=envs, device=self._model.device, custom_objects=own)
 
     def learn(
         self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
@@ -279,7 +278,9 @@ class EngineAgent(SB3Agent):
         return self._snapshot(*self.run.population.snapshot(self.run))
 
     def model_file(self) -> bytes:
-        return model_file(self.run)
+        put_weights(self.run)
+        buffers = ["rollout_buffer_class", "replay_buffer_class", "replay_buffer_kwargs"]
+        return model_file(self._model, buffers)
 
     def load(self, path: Path) -> None:
         super().load(path)

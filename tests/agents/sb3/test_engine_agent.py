@@ -1,7 +1,9 @@
 """Which settings the engine learns with, SB3's own model that it leaves, and settings that fall."""
 
 import contextlib
+import sys
 from pathlib import Path
+from subprocess import run
 from typing import Any
 
 import numpy as np
@@ -46,6 +48,38 @@ def test_the_model_is_sb3s_own_and_learns_on(agent: str, tmp_path: Path) -> None
         before = each.num_timesteps
         each.learn(100, reset_num_timesteps=False)
         assert each.num_timesteps >= before + 100
+
+
+OURS = "gridworld.agents.sb3"
+WITHOUT_US = """
+import sys
+sys.modules["gridworld"] = None  # an import of it fails
+import numpy as np, stable_baselines3 as sb3
+for name in sys.argv[1:]:
+    model = getattr(sb3, name.split(".")[0]).load(name, device="cpu")
+    print(*model.predict(np.load(name + ".npy"), deterministic=True)[0])
+"""
+
+
+def test_a_model_file_opens_where_this_package_is_not_installed(tmp_path: Path) -> None:
+    counting = [f"agent.replay_buffer_class={OURS}.replay_counts.ReplayCounts"]
+    cases = {
+        "PPO.coordinates": ["ppo", "observation=coordinates"],
+        "A2C.image": ["a2c", "observation=image"],
+        "DQN.colour": ["dqn", "observation=image", f"observation.features={OURS}.features.AgentByColour"],
+        "DQN.stock": ["dqn", "observation=coordinates", "agent.engine=stock", *counting],
+        "PPO.number": ["ppo", "observation=none"],
+    }
+    expected = []
+    for name, (agent, *words) in cases.items():
+        trained = built(*SHORT[agent], "n_envs=4", *words)
+        trained.learn(100, lambda steps: steps + 1)
+        (tmp_path / name).write_bytes(trained.model_file())
+        np.save(tmp_path / f"{name}.npy", trained.observation.table())
+        expected.append(trained.snapshot().greedy.tolist())
+    opened = run([sys.executable, "-c", WITHOUT_US, *cases], cwd=tmp_path, capture_output=True, text=True)
+    assert opened.returncode == 0, opened.stderr
+    assert [[int(each) for each in line.split()] for line in opened.stdout.splitlines()] == expected
 
 
 UNKNOWN = [
