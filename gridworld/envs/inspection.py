@@ -86,6 +86,7 @@ class Task:
     seen: Callable[[], ObservationTable] | None = None  # as it is now; None: a world alone was given
     # allowed actions (S, A), if anything is said
     masks: Callable[[], NDArray[np.bool_] | None] = lambda: None
+    normalizer: Any = None  # SB3's VecNormalize around it, if that changes observations
 
 
 def task_of(env: Any, max_episode_steps: int | None = None, **bounds: Any) -> Task:
@@ -285,7 +286,7 @@ def _batch(env: Any, **bounds: Any) -> Task:
         rows = _BY_METHOD[kind](env, _rows(below.seen()))
         return tabulated(env.observation_space, rows, below.mdp.num_states)
 
-    return replace(below, seen=seen)
+    return replace(below, seen=seen, normalizer=env if kind == "normalize" and env.norm_obs else None)
 
 
 def equal(one: Any, other: Any) -> bool:

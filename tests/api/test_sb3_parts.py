@@ -10,7 +10,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 import gridworld
 from gridworld import InputError
@@ -91,6 +91,55 @@ def test_it_keeps_the_best_model_and_stops_at_certificates(tmp_path: Path) -> No
     assert np.array_equal(kept["results"], found["return"][:, None])
     assert np.array_equal(kept["ep_lengths"], found["length"][:, None])
     assert np.array_equal(kept["regret"], found["regret"])
+
+
+def normalised(kind: str = "coordinates") -> VecNormalize:
+    if kind == "dict":
+        return VecNormalize(DummyVecEnv([AsDict]), norm_reward=False)
+    return VecNormalize(gridworld.make_vec_env("classic", n_envs=4, observation=kind))
+
+
+class AsDict(gym.ObservationWrapper[Any, Any, Any]):
+    """The coordinates as an entry of a Dict."""
+
+    def __init__(self) -> None:
+        super().__init__(gridworld.CoordinateObservation(gym.make(ENV)))
+        self.observation_space = gym.spaces.Dict({"place": self.env.observation_space})
+
+    def observation(self, observation: Any) -> Any:
+        return {"place": observation}
+
+
+@pytest.mark.parametrize("kind", ["coordinates", "dict"])
+def test_statistics_of_vec_normalize_belong_to_the_model(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    envs = normalised(kind)
+    callback = gridworld.ExactEvalCallback(every=64, best_model_save_path=tmp_path)
+    model = PPO("MultiInputPolicy" if kind == "dict" else "MlpPolicy", envs, n_steps=64, seed=0)
+    model.learn(256, callback=callback)
+    for other in (envs.venv, normalised(kind)):
+        with pytest.raises(InputError, match="VecNormalize, whose statistics the environment does not"):
+            gridworld.evaluate(model, other)
+        with pytest.raises((InputError, AssertionError), match="VecNormalize"):
+            model.learn(64, callback=gridworld.ExactEvalCallback(envs.venv))
+    assert gridworld.evaluate(model).regret == callback.evaluations["regret"][-1]
+
+    best = PPO.load(tmp_path / "best_model.zip")
+    capsys.readouterr()
+    again = VecNormalize.load(str(tmp_path / "vecnormalize.pkl"), normalised(kind).venv)
+    assert max(gridworld.evaluate(best, again).regret, 0) == callback.best_regret
+    assert not capsys.readouterr().err
+    model.save(tmp_path / "last.zip")
+    gridworld.evaluate(PPO.load(tmp_path / "last.zip"), envs.venv)
+    assert "if it was trained under VecNormalize, give env=VecNormalize.load(" in capsys.readouterr().err
+
+
+def test_rewards_alone_are_normalised_without_a_word(capsys: pytest.CaptureFixture[str]) -> None:
+    envs = VecNormalize(gridworld.make_vec_env("classic", n_envs=4), norm_obs=False)
+    model = PPO("MlpPolicy", envs, n_steps=32, seed=0).learn(128)
+    assert gridworld.evaluate(model, "classic") == gridworld.evaluate(model)
+    assert not capsys.readouterr().err
 
 
 def test_a_second_learn_goes_on_in_the_same_evaluations() -> None:

@@ -26,20 +26,23 @@ from gridworld.agents.sb3.policy_outputs import (
     why_unreadable,
     why_unsteady,
 )
-from gridworld.base.atomic_write import replacing
+from gridworld.base.atomic_write import replacing, write_bytes
 from gridworld.base.bounds import Bounds, discount
+from gridworld.base.console import tell
 from gridworld.base.errors import InputError, on_a_line
 from gridworld.config.compose import named_world
+from gridworld.engine.sb3_format import model_file
 from gridworld.envs.inspection import Task, equal, observation_like, tabulated, task_of
 from gridworld.envs.observations import KINDS, ObservationTable
 from gridworld.run.folder import BEST_MODEL, EVALUATIONS
 from gridworld.run.writer import write_evaluations
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.evaluation import Evaluator
-from gridworld.world.mdp import FloatArray
+from gridworld.world.mdp import FloatArray, leaves_of
 from gridworld.world.metrics import numbers
 from gridworld.world.shown import channels_first
 
+_STATISTICS = "vecnormalize.pkl"  # as RL Zoo calls it, for VecNormalize.load
 _KINDS: dict[str, type] = {"step": np.int64, "certified": np.bool_}
 
 
@@ -76,6 +79,7 @@ class ForeignPolicy:
         takes_masks = any("action_masks" in inspect.signature(each).parameters for each in predicts)
         self._masks = task.masks() if takes_masks else None
         self._is_known = is_of_libraries(model, policy)  # so that its network says how it explores
+        self._check_statistics()
         self._check_is_a_table(self._observation())
 
     def tables(self) -> Tables:
@@ -133,10 +137,40 @@ class ForeignPolicy:
             )
         self._guess_is_fine = True
 
+    def _check_statistics(self) -> None:
+        """Refuse other statistics of VecNormalize than the model's; warn where a file has lost them."""
+        own = getattr(self._model, "get_vec_normalize_env", lambda: None)()
+        theirs, last = self._task.normalizer, getattr(self._model, "_last_obs", None)
+        if own is not None and own.norm_obs:
+            if theirs is None or not np.array_equal(_moments(own), _moments(theirs)):
+                why = "does not apply" if theirs is None else "does not have"
+                raise InputError(
+                    f"the model was trained under VecNormalize, whose statistics the environment {why}; give "
+                    "env=model.get_env(), or copy them with sync_envs_normalization(model.get_env(), env)"
+                )
+        elif last is not None and self._model.env is None:
+            pairs = list(zip(leaves_of(self._observation().table()), leaves_of(last), strict=True))
+            for at in range(len(pairs[0][1])):
+                same = [(rows == each[at]).reshape(len(rows), -1).all(axis=1) for rows, each in pairs]
+                if np.all(same, axis=0).any():
+                    continue
+                tell(
+                    "the model: this world does not show what it saw last in training; if it was "
+                    "trained under VecNormalize, give env=VecNormalize.load(FILE, batch)"
+                )
+                return
+
     def _check_is_a_table(self, observation: ObservationTable) -> None:
         asked = self._model, self._policy, observation, self._task.mdp, self._masks
         if (reason := why_unsteady(*asked)) is not None:
             raise InputError(f"the model {reason}")
+
+
+def _moments(normalizer: VecNormalize) -> FloatArray:
+    """The means and variances by which it changes observations, (n,)."""
+    found = normalizer.obs_rms
+    parts = found.values() if isinstance(found, dict) else [found]
+    return np.concatenate([each.ravel() for part in parts for each in (part.mean, part.var)])
 
 
 class ExactEvalCallback(BaseCallback):
@@ -177,7 +211,7 @@ class ExactEvalCallback(BaseCallback):
             env: what to evaluate on, as for `gridworld.evaluate`; None: what the model is trained on.
             every: environment steps between two evaluations.
             best_model_save_path: a folder for `best_model.zip`, the model of the lowest exact regret, the
-                first of equals.
+                first of equals, and its `vecnormalize.pkl` if it learns under SB3's VecNormalize.
             log_path: a folder for `evaluations.npz`: `timesteps`, `results`, `ep_lengths` and `successes` as
                 SB3's `EvalCallback` writes them, and the columns of `evaluations`.
             stop_after: end training at so many certificates of optimality in a row, each of another policy;
@@ -221,6 +255,7 @@ class ExactEvalCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         task = self._task or self._evaluate_on(self.training_env)
+        self._copy_statistics()
         self._policy = ForeignPolicy(self.model, task)  # refuses what has no table
         self._evaluate()
 
@@ -236,11 +271,15 @@ class ExactEvalCallback(BaseCallback):
     def _on_training_end(self) -> None:
         self._evaluate()
 
+    def _copy_statistics(self) -> None:
+        """Evaluate with training's statistics of VecNormalize, as SB3's EvalCallback does."""
+        if isinstance(self._env, VecEnv) and is_vecenv_wrapped(self._env, VecNormalize):
+            sync_envs_normalization(self.training_env, self._env)
+
     def _evaluate(self) -> None:
         """Score the policy as it is now, and write what comes of it; once a step and policy."""
         assert self.evaluator is not None
-        if isinstance(self._env, VecEnv) and is_vecenv_wrapped(self._env, VecNormalize):
-            sync_envs_normalization(self.training_env, self._env)  # as SB3's EvalCallback does
+        self._copy_statistics()
         step = self.num_timesteps
         self._next = (step // self._every + 1) * self._every
         tables = self._policy.tables()
@@ -266,8 +305,10 @@ class ExactEvalCallback(BaseCallback):
                 print(f"step {step:,}: new best model, exact regret {self.best_regret:.3g}")
             if self._best_path is not None:
                 self._best_path.mkdir(parents=True, exist_ok=True)
-                with replacing(self._best_path / BEST_MODEL) as part, part.open("wb") as file:
-                    self.model.save(file)
+                write_bytes(self._best_path / BEST_MODEL, model_file(self.model))
+                if (normalizer := self.model.get_vec_normalize_env()) is not None:
+                    with replacing(self._best_path / _STATISTICS) as part:
+                        normalizer.save(str(part))
         if self._log_path is not None:
             table = self.evaluations
             self._log_path.mkdir(parents=True, exist_ok=True)
