@@ -14,6 +14,8 @@ from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 from gridworld.world.metrics import Z_95, wilson_interval
 
+_BUDGET = 10**7  # outcomes: about a tenth of a second
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -37,7 +39,7 @@ def _estimate_mean(
     samples: FloatArray,
     unseen: float,
     unseen_if_equal: float,
-    bounds: tuple[float, float] = (-math.inf, math.inf),
+    bounds: tuple[float, float],
 ) -> Estimate:
     """The mean of samples (n,), with a normal interval that is widened by what rare samples may hide.
 
@@ -50,7 +52,8 @@ def _estimate_mean(
     variance = float(samples.var(ddof=1)) / count if count > 1 else math.inf
     hidden = Z_95**2 * spread / (2 * count)
     half_width = hidden + math.hypot(Z_95 * variance**0.5, hidden)
-    return Estimate(mean, max(bounds[0], mean - half_width), min(bounds[1], mean + half_width))
+    low, high = max(bounds[0], mean - half_width), min(bounds[1], mean + half_width)
+    return Estimate(mean, min(low, mean), max(high, mean))  # which may be a bound but for rounding
 
 
 @dataclass(frozen=True)
@@ -90,18 +93,38 @@ def sample_episodes(evaluator: Evaluator, policy: FloatArray, episodes: int, see
         running &= ~terminated
         if not running.any():
             break
-    limit, rewards = evaluator.max_episode_steps, evaluator.mdp.reward[evaluator.mdp.probability > 0]
+    mdp, limit, gamma = evaluator.mdp, evaluator.max_episode_steps, evaluator.solution.gamma
+    rewards = mdp.reward[mdp.probability > 0]
     paid = max(np.ptp(rewards), np.abs(rewards).max())  # what one step may change
     at_most = max(paid, np.abs(rewards).min() * limit)  # ... and going on to the limit, or not
+    steps = np.broadcast_to(~mdp.terminal[:, None, None], mdp.reward.shape)
     return SampledScores(
         episodes=episodes,
-        discounted_return=_estimate_mean(discounted, paid, at_most),
-        goal=_estimate_share(evaluator.mdp.goal[states]),
-        trap=_estimate_share(evaluator.mdp.trap[states]),
+        discounted_return=_estimate_mean(discounted, paid, at_most, _possible(mdp, mdp.reward, gamma, limit)),
+        goal=_estimate_share(mdp.goal[states]),
+        trap=_estimate_share(mdp.trap[states]),
         timeout=_estimate_share(running),
-        episode_return=_estimate_mean(total, paid, at_most),
-        length=_estimate_mean(length, 0.0, limit, (0.0, limit)),
+        episode_return=_estimate_mean(total, paid, at_most, _possible(mdp, mdp.reward, 1.0, limit)),
+        length=_estimate_mean(length, 0.0, limit, _possible(mdp, steps, 1.0, limit)),
     )
+
+
+def _possible(mdp: Mdp, counted: FloatArray | BoolArray, gamma: float, limit: int) -> tuple[float, float]:
+    """The least and the greatest discounted sum of numbers (S, A, K) in an episode, whoever acts.
+
+    Exact within a budget; of the steps beyond it each counts the extreme number.
+    """
+    ends = []
+    for sign in (-1, 1):
+        paid = np.where(mdp.probability > 0, sign * counted, -np.inf)
+        best, left = np.zeros(mdp.num_states), limit
+        while left and (limit - left) * paid.size < _BUDGET:
+            before, left = best, left - 1
+            best = (paid + gamma * before[mdp.next_state]).max(axis=(1, 2))
+            if np.array_equal(best, before):
+                left = 0
+        ends.append(sign * float(best[mdp.start_states].max() + left * max(paid.max(), 0.0)))
+    return ends[0], ends[1]
 
 
 @dataclass(frozen=True, eq=False)

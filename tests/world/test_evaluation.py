@@ -223,6 +223,35 @@ def test_shares_have_intervals_even_without_a_hit() -> None:
     assert best.trap.high == pytest.approx(0.037, abs=1e-3)
 
 
+def test_intervals_of_few_episodes_are_within_what_is_possible() -> None:
+    few = sample_episodes(CLASSIC, CLASSIC.optimal_policy(), 10, seed=0)
+    assert (few.episode_return.mean, few.episode_return.high) == (1, 1)
+    assert few.episode_return.low == pytest.approx(0.232, abs=1e-3)
+    assert few.discounted_return.high == pytest.approx(0.99**7)
+    assert few.length.low == 5  # the nearest trap is one down and four to the right
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.3])
+def test_the_ends_of_intervals_are_those_of_all_walks(slip: float) -> None:
+    evaluator = Evaluator(compile_mdp(parse("A=5\nS.G\n.TA", "small"), slip, -0.5), 0.9, 6)
+    mdp, found = evaluator.mdp, []
+
+    def walk(state: int, steps: int, total: float, discounted: float) -> None:
+        if mdp.terminal[state] or steps == 6:
+            found.append((total, discounted, steps))
+            return
+        for action, outcome in np.argwhere(mdp.probability[state] > 0):
+            paid = mdp.reward[state, action, outcome]
+            following = int(mdp.next_state[state, action, outcome])
+            walk(following, steps + 1, total + paid, discounted + 0.9**steps * paid)
+
+    walk(0, 0, 0.0, 0.0)
+    one = sample_episodes(evaluator, np.full((6, 4), 0.25), 1, seed=0)  # of which nothing is known
+    estimates = one.episode_return, one.discounted_return, one.length
+    for estimate, ends in zip(estimates, np.transpose(found), strict=True):
+        assert (estimate.low, estimate.high) == pytest.approx((ends.min(), ends.max()))
+
+
 @pytest.mark.parametrize("layout", shipped_layouts())
 @pytest.mark.parametrize("gamma", [0.9, 1.0])
 @pytest.mark.parametrize("slip", [0.0, 0.5, 1.0])
