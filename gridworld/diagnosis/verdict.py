@@ -24,9 +24,9 @@ from gridworld.config.fields import Use
 from gridworld.config.settings import check_foreign
 from gridworld.config.train import TrainConfig
 from gridworld.diagnosis.causes import CAUSES, PHRASES
-from gridworld.diagnosis.causes.objective import recommended_gamma
 from gridworld.diagnosis.evidence import Evidence, Finding, RegretSplit
 from gridworld.training.saved_run import SavedRun
+from gridworld.training.setup import recommended_gamma
 from gridworld.visualization.maps import draw_regret
 from gridworld.world.evaluation import score_of_optimum
 from gridworld.world.mdp import IntArray, Mdp
@@ -129,7 +129,7 @@ def _offers(run: Evidence, findings: tuple[Finding, ...]) -> tuple[tuple[str, ..
     first, others = findings[0].changes, [word for each in findings[1:] for word in each.changes[:1]]
     changes = list(dict.fromkeys((*first, *others)))[:_MOST_CHANGES]
     key, fits = run.config.agent.key("gamma"), score_of_optimum(run.evaluator, run.own.gamma).certified
-    gamma = "" if fits else run.change("gamma", recommended_gamma(run, run.split.wrong))
+    gamma = "" if fits else run.change("gamma", recommended_gamma(run.evaluator))
     offers = []
     for each in changes:
         words = (each if fits or key in each else f"{each} {gamma}").split(" ")

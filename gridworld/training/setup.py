@@ -6,6 +6,8 @@ import dataclasses
 import functools
 from importlib.util import find_spec
 
+import numpy as np
+
 from gridworld.agents import TrainingContext, WriteScalars
 from gridworld.base.errors import InputError, install_command
 from gridworld.config.recipes import recipe_note
@@ -13,9 +15,12 @@ from gridworld.config.train import PICTURES, TrainConfig, check
 from gridworld.config.worlds import World, compiled
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
+from gridworld.world.chain import Chain, discounted_visits, one_hot_policy, stopping_states
 from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
+from gridworld.world.solver import solved
 
+SAME = 1e-9  # of the scale of the values: actions that differ by less are worth the same
 _QUICKLY_SOLVED = 6000  # outcomes of all states and actions
 
 
@@ -95,7 +100,7 @@ def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
 
 
 def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:
-    """Say that no agent with this discount can be certified, if that is so, with what would be right.
+    """Say that no agent with this discount can be certified, or only by luck, with what would be right.
 
     A world that takes longer than some tens of milliseconds to solve is not looked at.
     """
@@ -104,13 +109,38 @@ def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:
         return None
     judge = Evaluator(mdp, judged, config.env.step_limit(mdp))
     try:
-        score = score_of_optimum(judge, float(gamma))
+        score, own = score_of_optimum(judge, float(gamma)), solved(mdp, float(gamma))
     except InputError:  # no finite optimum
         return None
-    if score.certified:
+    key = config.agent.key("gamma")
+    mistake, right = f"{key.lstrip('+')}={gamma:g}: ", f"; use {key}={recommended_gamma(judge):g}"
+    if not score.certified:
+        mistake += f"its optimum has a regret of {score.regret:.2g} under evaluation.gamma={judged:g}"
+        return f"{mistake}, too much for a certificate{right}"
+    alike = own.q >= own.v[:, None] - SAME * own.scale[:, None]
+    if config.agent.algorithm == "value_iteration":  # of equals, it takes what comes nearer to the end
+        alike = own.optimal
+    rank = np.where(alike, np.maximum(judge.solution.q, np.finfo(np.float64).min), np.inf)
+    worst = judge.score(one_hot_policy(rank.argmin(axis=1), mdp.num_actions))
+    if worst.certified:
         return None
-    key, right = config.agent.key("gamma"), fitting_discounts(judge)[0]
     return (
-        f"{key.lstrip('+')}={gamma:g}: its optimum has a regret of {score.regret:.2g} under "
-        f"evaluation.gamma={judged:g}, too much for a certificate; use {key}={right:g}"
+        f"{mistake}wrong actions are worth as much as the right ones (a regret of {worst.regret:.2g}){right}"
     )
+
+
+def recommended_gamma(judge: Evaluator) -> float:
+    """Of discounts with the judge's optimum, that under which the right actions stand out most.
+
+    By the smallest gap in the states that an episode of the optimal policy comes to most often.
+    """
+    chain = Chain(judge.mdp, judge.optimal_policy())
+    visits = discounted_visits(chain, 1.0, stopping_states(chain, 1.0)) * judge.mdp.acting
+    often = visits >= visits.max() / 2
+
+    def smallest_gap(gamma: float) -> float:
+        best = solved(judge.mdp, gamma)
+        others = np.where(best.optimal, -np.inf, best.q).max(axis=1)
+        return float((best.v - others)[often].min())
+
+    return max(fitting_discounts(judge), key=smallest_gap)

@@ -327,6 +327,43 @@ def test_it_is_said_with_what_would_be_right(words: str, said: str, right: str) 
     assert note(*words.split(), right) is None
 
 
+@pytest.mark.parametrize(
+    ("words", "right"),
+    [
+        ("agent=q_learning agent.gamma=1", 0.9),
+        ("agent=ppo agent.gamma=1 env=four_rooms", 0.95),
+        ("agent=dqn agent.gamma=0", 0.9),
+        ("agent=value_iteration agent.gamma=0", 0.9),
+    ],
+)
+def test_a_discount_under_which_right_and_wrong_tie_is_named(words: str, right: float) -> None:
+    found = note(*words.split())
+    assert found is not None
+    assert "are worth as much as the right ones" in found
+    assert found.endswith(f"agent.gamma={right}")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "agent=value_iteration agent.gamma=1",  # it takes the way to the end
+        "agent=q_learning agent.gamma=1 env=cliff",  # a step costs
+        "agent=q_learning agent.gamma=1 evaluation.gamma=1",
+    ],
+)
+def test_without_a_tie_nothing_is_said_of_a_discount_of_1(words: str) -> None:
+    assert note(*words.split()) is None
+
+
+@pytest.mark.parametrize(
+    "words", ["agent=q_learning agent.gamma=1", "agent=dqn agent.gamma=0.5 env.slip=0.2"]
+)
+def test_the_note_and_the_diagnosis_name_the_same_discount(words: str) -> None:
+    found = gridworld.diagnose(gridworld.train(*words.split(), "tuned=none", seed=0, progress=False))
+    assert found.cause == "objective"
+    assert (note(*words.split()) or "").endswith(f"use {found.first_change}")
+
+
 def test_nothing_is_said_of_what_fits_or_would_take_long(tmp_path: Path) -> None:
     assert note("agent=dqn") is None
     assert note("agent=dqn", "env.slip=0.1") is None

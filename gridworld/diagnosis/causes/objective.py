@@ -12,11 +12,10 @@ from gridworld.diagnosis.evidence import (
     entropy_optimum,
     optimum_of_epsilon,
 )
-from gridworld.world.evaluation import fitting_discounts
-from gridworld.world.mdp import BoolArray, FloatArray
+from gridworld.training.setup import SAME, recommended_gamma
+from gridworld.world.mdp import FloatArray
 from gridworld.world.solver import pick, solved
 
-_NOTHING = 1e-9  # of the scale of the values
 _CLEARER = 5  # times the gap
 _FAINT = 1e-3  # of the largest reward: less than a network's values resolve
 _SPREAD = 0.5  # of the entropy of a uniform policy
@@ -26,11 +25,11 @@ _POOR = 0.5  # of a uniform policy's regret
 def other_optimum(run: Evidence) -> Finding | None:
     """What it does is optimal under its own discount, exactly."""
     best = run.evaluator.solution
-    states = run.split.wrong & (run.gap <= _NOTHING * run.own.scale)
+    states = run.split.wrong & (run.gap <= SAME * run.own.scale)
     if run.gamma == best.gamma or not states.any():
         return None
     why = f"its policy is optimal under its gamma of {run.gamma:g}, not under the evaluation's {best.gamma:g}"
-    gammas = dict.fromkeys((recommended_gamma(run, states), best.gamma))
+    gammas = dict.fromkeys((recommended_gamma(run.evaluator), best.gamma))
     return Finding("objective", states, why, tuple(run.change("gamma", each) for each in gammas))
 
 
@@ -46,19 +45,17 @@ def faint_gamma(run: Evidence) -> Finding | None:
 
 
 def _faint(run: Evidence, limit: FloatArray) -> Finding | None:
-    better = recommended_gamma(run, run.split.wrong)
+    better = recommended_gamma(run.evaluator)
     clear = gap_under(run, better)
     states = run.split.wrong & (run.gap < limit) & (clear > _CLEARER * run.gap)
     if better == run.gamma or not states.any():
         return None
     worst = costliest(run, states)
-    worth = f"worth only {run.gap[worst]:.2g} more, less than the error of its values"
-    if run.gap[worst] <= _NOTHING * run.own.scale[worst]:
-        worth = "not worth more than what it does"
-    why = (
-        f"with its gamma of {run.gamma:g} the right action is {worth}; with {better:g} it is worth "
-        f"{clear[worst]:.2g} more"
-    )
+    worth = f"the right action is worth only {run.gap[worst]:.2g} more, less than the error of its values"
+    if run.gap[worst] <= SAME * run.own.scale[worst]:
+        worth = "the right action and the one that it takes are worth the same"
+    gains = f"with gamma={better:g} the right one is worth {clear[worst]:.2g} more"
+    why = f"with gamma={run.gamma:g}, {worth}; {gains}"
     return Finding("objective", states, why, (run.change("gamma", better),))
 
 
@@ -66,13 +63,6 @@ def gap_under(run: Evidence, gamma: float) -> FloatArray:
     """(S,), what the greedy action loses under a discount."""
     best = solved(run.mdp, gamma)
     return np.asarray(best.v - pick(best.q, run.greedy))
-
-
-def recommended_gamma(run: Evidence, states: BoolArray) -> float:
-    """Of discounts with the evaluation's optimum, that whose smallest gap in these states (S,) is largest."""
-    gammas = fitting_discounts(run.evaluator)
-    found = {gamma: float(np.min(gap_under(run, gamma)[states], initial=np.inf)) for gamma in gammas}
-    return max(found, key=lambda each: found[each])
 
 
 def too_much_entropy(run: Evidence) -> Finding | None:
