@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
+import textwrap
 from collections.abc import Sequence
+from dataclasses import replace
 
-from gridworld.base.console import aligned, printable, tell, telling_if_slow
+from gridworld.base.console import aligned, duration, printable, tell, telling_if_slow
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import check_no_link
 from gridworld.base.user_input import limited
 from gridworld.commands import parser_of
+from gridworld.config.compose import compose
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.verdict import (
     Diagnosis,
@@ -26,6 +30,7 @@ from gridworld.visualization.files import save_png
 
 PICTURE = "diagnosis.png"
 _MOST_ROWS = 8
+_NARROW, _WIDE = 80, 100  # columns of what is read
 _NONE = 1  # the exit code
 
 
@@ -35,16 +40,20 @@ def main(arguments: Sequence[str]) -> None:
     options = _parser().parse_args(arguments)
     with telling_if_slow(f"diagnosing {options.run}"):
         saved = SavedRun(options.run, options.trust)
-        found = diagnose(Evidence.of(saved))
+        run = Evidence.of(saved)
+        found = diagnose(run)
     print(printable(f"greedy policy of {options.run} on {saved.mdp.name}"))
     if found.findings:
         print(_table(found))
-    print(printable(found.sentence()))
+    width = min(max(shutil.get_terminal_size().columns, _NARROW), _WIDE)
+    print(*textwrap.wrap(printable(found.sentence()), width, break_on_hyphens=False), sep="\n")
     if found.findings and saved.omission:
         print(printable(saved.omission))
     elif found.commands:
         print("Try, one at a time:")
-        print(*(printable(f"  {line}") for line in found.commands), sep="\n")
+        for line, words in zip(found.commands, found.offers, strict=True):
+            print(printable(f"  {line}"))  # whole, to be copied
+            print(_price(saved, run, words), end="")
     if found.findings:
         path = options.run / PICTURE
         try:
@@ -57,6 +66,23 @@ def main(arguments: Sequence[str]) -> None:
         check_trusted(saved, found, options.trust)
         if not _is_any_certified(saved, found, options):
             sys.exit(_NONE)
+
+
+def _price(saved: SavedRun, run: Evidence, words: Sequence[str]) -> str:
+    """A line with the steps of an offer, and about how long they take by the run's own speed.
+
+    Time grows with the updates and with the steps of the batch of environments, of which an update takes
+    about as long as four. Nothing where the words cannot be composed here.
+    """
+    try:
+        offer = replace(run, config=compose(words, lambda env: saved.mdp))
+    except InputError:
+        return ""
+    work, own = (each.updates + each.steps / each.config.n_envs / 4 for each in (offer, run))
+    summary = saved.run.read_summary()
+    share = min(summary["timesteps"] / run.steps, 1.0)  # it may have ended early
+    seconds = summary["train_seconds"] * work / own / max(share, 1e-9)
+    return f"    {offer.steps:,} steps, about {duration(max(seconds, 1.0))}\n"
 
 
 def _is_any_certified(saved: SavedRun, found: Diagnosis, options: argparse.Namespace) -> bool:

@@ -172,16 +172,24 @@ class Evidence:
         given = getattr(self.config.agent, name, None)
         return getattr(self.config.agent, "arguments", {}).get(name) if given is None else given
 
+    @property
+    def rollout(self) -> int:
+        """The environment steps from one update to the next."""
+        return int(self.setting("train_freq") or self.setting("n_steps", 1)) * self.config.n_envs
+
+    @property
+    def steps(self) -> int:
+        """The environment steps of training, which ends with a whole rollout."""
+        return math.ceil(self.config.total_timesteps / self.rollout) * self.rollout
+
     @cached_property
     def updates(self) -> float:
         """How many gradient steps training made, as its settings say."""
-        total, envs = self.config.total_timesteps, self.config.n_envs
+        total, rollout = self.steps, self.rollout
         if epochs := self.setting("n_epochs"):
-            rollout = self.setting("n_steps", 1) * envs
             return total / rollout * epochs * math.ceil(rollout / self.setting("batch_size", 64))
         if not self.setting("train_freq"):
-            return total / (self.setting("n_steps", 1) * envs)
-        rollout = self.setting("train_freq", 1) * envs
+            return total / rollout
         steps = self.setting("gradient_steps", 1)
         learns = max(0.0, total - self.setting("learning_starts"))
         return learns / rollout * (rollout if steps < 0 else steps)
@@ -191,6 +199,11 @@ def entropy(policy: FloatArray) -> FloatArray:
     """(S,), the entropy of a policy (S, A), 1 where it is uniform."""
     logs = np.log(np.maximum(policy, 1e-300))
     return np.asarray(np.abs((policy * logs).sum(axis=1)) / max(np.log(policy.shape[1]), 1e-300))
+
+
+def percent(share: float) -> str:
+    """Write 0.0138 as 1.4%."""
+    return f"{100 * share:.2g}%" if share < 0.995 else "100%"
 
 
 @dataclass(frozen=True, eq=False)

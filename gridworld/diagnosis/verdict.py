@@ -130,10 +130,12 @@ def _offers(run: Evidence, findings: tuple[Finding, ...]) -> tuple[tuple[str, ..
     changes = list(dict.fromkeys((*first, *others)))[:_MOST_CHANGES]
     key, fits = run.config.agent.key("gamma"), score_of_optimum(run.evaluator, run.own.gamma).certified
     gamma = "" if fits else run.change("gamma", recommended_gamma(run.evaluator))
+    added = {_key(word) for word in run.overrides if word.startswith("+")}  # to what the yaml files have
     offers = []
     for each in changes:
         words = (each if fits or key in each else f"{each} {gamma}").split(" ")
         changed = set(map(_key, words))
+        words = [f"+{word}" if word.partition("=")[0] in added else word for word in words]
         offers.append((*(word for word in run.overrides if _key(word) not in changed), *words))
     return tuple(offers)
 

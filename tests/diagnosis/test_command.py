@@ -1,5 +1,6 @@
 """The command `diagnose` on finished runs, and the picture that it draws."""
 
+import itertools
 import re
 import shlex
 import shutil
@@ -38,7 +39,7 @@ def spoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_ends_with_a_sentence_and_commands_that_can_be_typed(spoilt: Path, capsys) -> None:
     diagnose.main([str(spoilt)])
     told = capsys.readouterr().out
-    assert re.search(r"^(The|\d+% of the) regret of 0.932: .*\.$", told, re.MULTILINE)
+    assert re.search(r"^(The|\d+% of the) regret of 0.932: .*?\.$", told, re.MULTILINE | re.DOTALL)
     lines = [line.strip() for line in told.splitlines() if "gridworld train" in line]
     assert 1 <= len(lines) <= 3
     for line in lines:
@@ -47,6 +48,35 @@ def test_it_ends_with_a_sentence_and_commands_that_can_be_typed(spoilt: Path, ca
     found = gridworld.diagnose(run)
     assert found.sentence() == gridworld.diagnose(spoilt).sentence()
     assert found.split.cost.sum() == pytest.approx(run.summary["regret"], abs=1e-9)
+
+
+@pytest.mark.parametrize(("columns", "most"), [(20, 80), (90, 90), (300, 100)])
+def test_the_sentence_is_wrapped(spoilt: Path, columns: int, most: int, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    diagnose.main([str(spoilt)])
+    lines = capsys.readouterr().out.splitlines()
+    first = next(number for number, line in enumerate(lines) if "regret of 0.932: " in line)
+    sentence = lines[first : lines.index("Try, one at a time:")]
+    assert len(sentence) > 1
+    assert max(map(len, sentence)) <= most < len(" ".join(sentence))
+    assert " ".join(sentence) == gridworld.diagnose(spoilt).sentence()
+
+
+def test_an_offer_has_the_steps_that_it_trains_and_about_its_time(tmp_path: Path, capsys) -> None:
+    """Of PPO, which trains by whole rollouts, at first two of 32 steps in each of 16 environments."""
+    words = ["agent=ppo", "n_envs=16", "agent.n_steps=32", "agent.batch_size=64", "total_timesteps=600"]
+    gridworld.train(*words, "agent.max_grad_norm=1e-6", folder=tmp_path / "run", seed=0, progress=False)
+    diagnose.main([str(tmp_path / "run")])
+    lines = capsys.readouterr().out.splitlines()
+    printed = [(line, under) for line, under in itertools.pairwise(lines) if "gridworld train" in line]
+    assert printed
+    for line, under in printed:
+        config = gridworld.compose(*shlex.split(line)[2:])
+        rollout = config.n_envs * config.agent.n_steps
+        steps = -(-config.total_timesteps // rollout) * rollout
+        assert re.fullmatch(rf"    {steps:,} steps, about \d+ (s|min \d+ s|h \d+ min)", under)
+    trained = gridworld.train(*shlex.split(printed[0][0])[2:], progress=False)
+    assert trained.summary["timesteps"] == 1024
 
 
 def test_the_picture_has_the_world_and_the_cells_that_cost(spoilt: Path) -> None:

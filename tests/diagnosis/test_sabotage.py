@@ -115,6 +115,18 @@ OTHERS = {  # settings, the causes that name it, what the sentence or the comman
     "what is best for one that explores": (
         "agent=sarsa env=cliff tuned=none total_timesteps=60000 "
         "agent.exploration_initial_eps=0.5 agent.exploration_final_eps=0.5", "epsilon", ()),
+    "gradients clipped to nothing": (
+        "agent=ppo agent.max_grad_norm=1e-6", "clipping",
+        ("clipped to max_grad_norm=1e-06", "agent.max_grad_norm=0.5")),
+    "the same of a class": (
+        "agent=a2c +agent.arguments.max_grad_norm=1e-7", "clipping",
+        (" +agent.arguments.max_grad_norm=0.5",)),
+    "never a random action": (
+        "agent=dqn agent.exploration_initial_eps=0 agent.exploration_final_eps=0", "exploration",
+        ("it hardly ever took a random action", "0 of its 30,000", "agent.exploration_initial_eps=1")),
+    "hardly ever one, with optimism": (
+        "agent=q_learning env=cliff tuned=none agent.exploration_initial_eps=1e-4 "
+        "agent.exploration_final_eps=1e-4", "exploration", ("it hardly ever took a random action",)),
     "no entropy bonus to raise": (
         "agent=trpo exploration_bonus=0 total_timesteps=40000", "exploration budget",
         ("exploration_bonus=0.1",)),
@@ -129,7 +141,14 @@ def test_what_else_is_told(what: str) -> None:
     assert found.cause in causes.split()
     told = " ".join([found.sentence(), *found.commands])
     assert all(part in told for part in parts)
+    assert "still learning" not in told
     assert "ent_coef" not in told
+
+
+def test_shares_are_said_in_percent() -> None:
+    words = ["agent=a2c", "agent.arguments.ent_coef=0", "seed=0"]
+    found = gridworld.diagnose(gridworld.train(*words, progress=False)).sentence()
+    assert "it reached the goal in 1.4% of episodes at first and practically never at the end" in found
 
 
 def test_a_certificate_that_was_lost_is_said() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gridworld.base.bounds import LINEAR
-from gridworld.diagnosis.evidence import Evidence, Finding, best_of_what_was_tried, longer
+from gridworld.diagnosis.evidence import Evidence, Finding, best_of_what_was_tried, longer, percent
 from gridworld.world.chain import Chain
 from gridworld.world.mdp import BoolArray
 
@@ -16,6 +16,8 @@ _DECIDED = 0.3  # of a uniform policy's entropy: below, it hardly explores
 _WIDE = 128  # environments
 _BONUS = 0.1  # what a first visit pays
 _LEFT = 0.2  # of how often the first policy met the goal
+_NEVER = 0.01  # of all steps
+_RARE = 1e-4  # of all episodes
 
 
 def not_tried(run: Evidence) -> Finding | None:
@@ -40,8 +42,20 @@ def collapsed(run: Evidence) -> Finding | None:
         states = decided | (run.split.wrong & (goal[-1] < _LEFT * goal[0]))
     if not states.any():
         return None
-    why = f"its exploring policy reached the goal in {goal[0]:.2g} of its episodes at first"
-    return _exploration(run, states, f"{why} and in {goal[-1]:.2g} at the end")
+    first, last = ("practically never" if each < _RARE else f"in {percent(each)}" for each in goal[[0, -1]])
+    first = f"{first} of episodes" if first.endswith("%") else first
+    why = f"while it explored, it reached the goal {first} at first and {last} at the end"
+    return _exploration(run, states, why)
+
+
+def never_random(run: Evidence) -> Finding | None:
+    """It hardly ever took a random action, and nothing else led it away from its own policy."""
+    has_epsilon = run.setting("exploration_final_eps", -1.0) >= 0
+    is_led, random = run.config.exploration_bonus or run.config.exploring_starts, _random(run)
+    explored = random >= _NEVER or random * run.config.total_timesteps >= run.steps_to_goal
+    if is_led or explored or not has_epsilon:
+        return None
+    return _exploration(run, run.split.wrong, "it hardly ever took a random action")
 
 
 def ended_early(run: Evidence) -> Finding | None:
@@ -58,7 +72,7 @@ def _exploration(run: Evidence, states: BoolArray, why: str) -> Finding:
     """Whether the steps were too few even for a random walk, or were not used to explore."""
     total, random, needed = run.config.total_timesteps, _random(run), run.steps_to_goal
     told = "" if np.isinf(needed) else f"; a random walk finds the goal once in {needed:,.0f} steps"
-    if total < needed or random > _RANDOM:
+    if (total < needed and random >= _NEVER) or random > _RANDOM:
         changes = (longer(run, 10), *_explore(run)[:2])
         return Finding("budget", states, f"{why}{told}, and it had {total:,}", changes)
     spent = "" if run.is_actor_critic else f", and {random * total:,.0f} of its {total:,} were random"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from inspect import signature
+
 import numpy as np
 
 from gridworld.base.bounds import LINEAR
@@ -15,6 +17,7 @@ from gridworld.diagnosis.evidence import (
     faster,
     longer,
     on_the_way,
+    percent,
     slower,
     visits_needed,
 )
@@ -26,6 +29,7 @@ _SMALL, _LARGE = 0.02, 50  # values that networks hardly learn
 _MOVES = 0.1  # Adam moves a weight by about the learning rate an update: less than this in all is nothing
 _MOST_TIMES = 50  # as long
 _EVENLY = "n_envs=256 exploring_starts=1 stratified_draws=true"  # what leaves least to chance
+_GRADIENT = 1e-3  # what each weight's gradient should have without an optimiser that scales it
 _FEW_UPDATES = 500  # of a network: fewer are too few whatever its target
 _REFRESHES = 2  # of the target network, for each step of the way to the goal
 
@@ -69,6 +73,21 @@ def scaled(run: Evidence) -> Finding | None:
     return Finding("scale", run.split.wrong, why, (run.change("reward_scale", 1 / run.largest_reward),))
 
 
+def clipped(run: Evidence) -> Finding | None:
+    """`max_grad_norm` leaves gradients that are small beside the number that the optimiser adds to theirs."""
+    most = run.setting("max_grad_norm", np.inf)
+    optimizer = getattr(getattr(run.agent.model, "policy", None), "optimizer", None)
+    if optimizer is None or most == np.inf or not run.takes("max_grad_norm"):
+        return None
+    (group,) = optimizer.param_groups
+    each = most / sum(weights.numel() for weights in group["params"]) ** 0.5
+    if each >= group.get("eps", _GRADIENT):
+        return None
+    why = f"its gradients are clipped to max_grad_norm={most:g}, which leaves too little to learn from"
+    usual = signature(type(run.agent.model)).parameters["max_grad_norm"].default
+    return Finding("clipping", run.split.wrong, why, (run.change("max_grad_norm", usual or 10.0),))
+
+
 def hardly_moved(run: Evidence) -> Finding | None:
     """All updates together are too small to have moved a network's weights."""
     rate = run.setting("learning_rate")
@@ -93,8 +112,8 @@ def overshot(run: Evidence) -> Finding | None:
         return None
     worst = costliest(run, states)
     why = (
-        f"its updates overshoot: in {run.mdp.state_name(worst)} its policy has {run.spread[worst]:.2g} of "
-        f"the maximum entropy, while its bonus of {bonus:g} aims at {aim[worst]:.2g}"
+        f"its updates overshoot: in {run.mdp.state_name(worst)} its policy has {percent(run.spread[worst])} "
+        f"of the maximum entropy, while its bonus of {bonus:g} aims at {percent(aim[worst])}"
     )
     return Finding("rate", states, why, slower(run))
 
@@ -154,7 +173,7 @@ def _slow_table(run: Evidence, states: BoolArray) -> Finding | None:
     if left < _FORGOTTEN:
         return None
     why = (
-        f"its values have not converged: in {where}, the initial values still make up {left:.0%} after "
+        f"its values have not converged: in {where}, the initial values still make up {percent(left)} after "
         f"{'1 update' if tried == 1 else f'{tried:,} updates'}"
     )
     changes = [run.change("learning_rate_power", 0.0)] if power else []

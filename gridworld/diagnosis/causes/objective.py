@@ -11,6 +11,7 @@ from gridworld.diagnosis.evidence import (
     entropy,
     entropy_optimum,
     optimum_of_epsilon,
+    percent,
 )
 from gridworld.training.setup import SAME, recommended_gamma
 from gridworld.world.mdp import FloatArray
@@ -93,5 +94,5 @@ def too_much_epsilon(run: Evidence) -> Finding | None:
     states = run.split.wrong & ((gap <= 1e-9) | unresolved)
     if not states.any():
         return None
-    why = f"it learns what is optimal for an agent that acts at random with probability {epsilon:g}"
+    why = f"it learns what is optimal for an agent that takes {percent(epsilon)} of its actions at random"
     return Finding("epsilon", states, why, (run.change("exploration_final_eps", epsilon / 10),))
