@@ -138,7 +138,13 @@ def _ends(outcomes: Outcomes) -> tuple[IntArray, BoolArray, IntArray, IntArray]:
     first = ending & playing[:, None, None]
     success = outcomes.success
     if success is None:
-        success = outcomes.reward == outcomes.reward[first].max(initial=-np.inf)
+        here = np.arange(size)[:, None, None]
+        # Where an episode begins at its end, the step that says so pays nothing, and is compared with none.
+        over = ((outcomes.terminated & (outcomes.next_state == here)) | ~possible).all(axis=(1, 2))
+        paid = first & ~over[:, None, None] if (first[~over]).any() else first
+        success = outcomes.reward == outcomes.reward[paid].max(initial=-np.inf)
+        reached = np.isin(np.arange(size), outcomes.next_state[paid & success])
+        success = np.where(over[:, None, None] & ~paid, reached[:, None, None], success)
     # An end is known by its number and whether it is a success: the last bit of its key.
     every = 2 * outcomes.next_state.astype(np.int64) + success
     keys = np.unique(every[first])

@@ -9,8 +9,10 @@ from helpers.oracle import MOVES, worlds
 from hypothesis import given
 
 from gridworld import InputError
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
+from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 
 
 @given(worlds())
@@ -89,3 +91,25 @@ def test_a_cliff_that_pays_is_refused():
     with pytest.raises(InputError, match=r"trap_reward=0.5: must be at most 0 on maps with a cliff"):
         compile_mdp(cliff, trap_reward=0.5)
     assert compile_mdp(cliff, trap_reward=0).reward.max() == 1
+
+
+@pytest.mark.parametrize("pays_at_the_end", [0.0, -1.0])
+def test_an_episode_that_begins_at_its_end_makes_no_goal_of_its_own(pays_at_the_end: float) -> None:
+    """The 4x4 of Sutton and Barto (example 4.1) as courses have it: starts anywhere, two ends, -1 a step."""
+    shape, row, column = (16, 4, 1), *np.divmod(np.arange(16), 4)
+    moves = [(-1, 0), (0, 1), (1, 0), (0, -1)]
+    following = [4 * np.clip(row + down, 0, 3) + np.clip(column + right, 0, 3) for down, right in moves]
+    next_state, over = np.stack(following, axis=1)[..., None], np.isin(np.arange(16), [0, 15])
+    next_state[over] = np.array([0, 15])[:, None, None]
+    reward = np.where(over[:, None, None], pays_at_the_end, np.full(shape, -1.0))
+    terminated = over[next_state]
+    outcomes = Outcomes(
+        next_state=next_state,
+        probability=np.ones(shape),
+        reward=reward,
+        terminated=terminated,
+        start=np.full(16, 1 / 16),
+    )
+    found = Evaluator(mdp_from_outcomes("4x4", outcomes), 1.0, 100).optimum
+    assert (found.goal, found.trap) == (1, 0)
+    assert found.expected_length == pytest.approx((2 * 1 + 4 * 1 + 6 * 2 + 4 * 3) / 16)
