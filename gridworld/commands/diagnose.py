@@ -31,6 +31,7 @@ from gridworld.visualization.files import save_png
 PICTURE = "diagnosis.png"
 _MOST_ROWS = 8
 _NARROW, _WIDE = 80, 100  # columns of what is read
+_OTHER_COLUMNS = 56  # of a table, beside the states' names
 _NONE = 1  # the exit code
 
 
@@ -43,9 +44,9 @@ def main(arguments: Sequence[str]) -> None:
         run = Evidence.of(saved)
         found = diagnose(run)
     print(printable(f"greedy policy of {options.run} on {saved.mdp.name}"))
-    if found.findings:
-        print(_table(found))
     width = min(max(shutil.get_terminal_size().columns, _NARROW), _WIDE)
+    if found.findings:
+        print(_table(found, width))
     print(*textwrap.wrap(printable(found.sentence()), width, break_on_hyphens=False), sep="\n")
     if found.findings and saved.omission:
         print(printable(saved.omission))
@@ -106,8 +107,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _table(found: Diagnosis) -> str:
+def _table(found: Diagnosis, width: int) -> str:
     """The states that cost most, with their cause."""
+    room = width - _OTHER_COLUMNS
     split = found.split
     rows = [["state", "takes", "visits", "lost", "regret", "cause"]]
     costly = [state for state in (-split.cost).argsort(kind="stable").tolist() if found.cause_of[state] >= 0]
@@ -115,7 +117,9 @@ def _table(found: Diagnosis) -> str:
         action = found.mdp.action_names[found.greedy[state]]
         numbers = [f"{each[state]:.3g}" for each in (split.visits, split.lost, split.cost)]
         cause = found.findings[found.cause_of[state]].cause
-        rows.append([found.mdp.state_name(state), action, *numbers, f" {cause}"])
+        name = found.mdp.state_name(state)
+        name = name if len(name) <= room else f"{name[: room - 3]}..."
+        rows.append([name, action, *numbers, f" {cause}"])
     if len(costly) > _MOST_ROWS:
         rest = float(split.cost[costly[_MOST_ROWS:]].sum())
         rows.append([f"and {len(costly) - _MOST_ROWS:,} more", "", "", "", f"{rest:.3g}", ""])

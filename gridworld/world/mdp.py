@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from gridworld.base.bounds import Bounds
 from gridworld.base.errors import InputError
+from gridworld.world.shown import unusual_numbers, usual_numbers
 
 IntArray = NDArray[np.integer[Any]]
 FloatArray = NDArray[np.float64]
@@ -177,14 +178,20 @@ class Mdp:
         return (int(self.number[state]),)
 
     def state_name(self, state: int) -> str:
-        """What messages call a state: its name, else its place and panel, else its number."""
+        """What messages call a state: its name, else its place, else what it shows, else its number."""
         if self.state_names:
             return self.state_names[int(self.number[state])]
         if self.places is None or (self.places[state] < 0).any():
+            if self.is_enumerated and self._usual:
+                return f"observation with {unusual_numbers(self.own_observation, self._usual, state)}"
             return f"state {int(self.number[state])}"
         panel, row, col = self.places[state].tolist()
         where = f"row {row + 1}, column {col + 1}"
         return f"{where} ({self.panel_names[panel]})" if self.panel_names else where
+
+    @cached_property
+    def _usual(self) -> dict[str, NDArray[Any]]:
+        return {} if self.own_observation is None else usual_numbers(self.own_observation)
 
     def action_choices(self) -> str:
         """The actions for a message: 0 (up), 1 (right), 2 (down) or 3 (left)."""

@@ -13,10 +13,12 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import check_memory
 
+_MOST_NAMED = 4  # numbers of an observation
 _ARRAYS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
@@ -53,6 +55,26 @@ def channels_first(space: gym.Space[Any], rows: Any) -> tuple[gym.Space[Any], An
         return space, rows
     turned = np.ascontiguousarray(np.moveaxis(rows, -1, 1))
     return spaces.Box(0, 255, turned.shape[1:], np.uint8), turned
+
+
+def usual_numbers(rows: Any) -> dict[str, NDArray[Any]]:
+    """By the keys of a Dict, the number (n,) at each place that lies in the middle of those of all states."""
+    parts = rows if isinstance(rows, dict) else {"": rows}
+    flat = {key: each.reshape(len(each), -1) for key, each in parts.items()}
+    return {key: np.partition(each, len(each) // 2, axis=0)[len(each) // 2] for key, each in flat.items()}
+
+
+def unusual_numbers(rows: Any, usual: dict[str, NDArray[Any]], state: int) -> str:
+    """What tells a state's observation from most others: "[3]=1, [7]=0.5 and 2 more"."""
+    found = []
+    for key, middle in usual.items():
+        part = rows[key] if isinstance(rows, dict) else rows
+        own = part[state].ravel()
+        for at in np.flatnonzero(own != middle):
+            place = np.unravel_index(at, part.shape[1:])
+            found.append(f"{key}[{', '.join(map(str, map(int, place)))}]={own[at]:g}")
+    more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
+    return f"{', '.join(found[:_MOST_NAMED]) or 'its usual numbers'}{more}"
 
 
 def stacked(space: gym.Space[Any], parts: Iterator[Any]) -> Any:

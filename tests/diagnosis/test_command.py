@@ -62,6 +62,63 @@ def test_the_sentence_is_wrapped(spoilt: Path, columns: int, most: int, monkeypa
     assert " ".join(sentence) == gridworld.diagnose(spoilt).sentence()
 
 
+ENVS = """
+import gymnasium as gym, numpy as np
+class Image(gym.Env):
+    observation_space, action_space = gym.spaces.Box(0, 255, (8, 8, 3), np.uint8), gym.spaces.Discrete(2)
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at = 3
+        return self.shown(), {}
+    def shown(self):
+        image = np.full((8, 8, 3), 7, np.uint8)
+        image[2, self.at] = 255
+        return image
+    def step(self, action):
+        self.at = max(0, self.at + 2 * action - 1)
+        return self.shown(), float(self.at == 7), self.at == 7, False, {}
+class Vector(Image):
+    observation_space = gym.spaces.Box(0, 1, (30,), np.float32)
+    def shown(self):
+        return np.eye(30, dtype=np.float32)[3 * self.at]
+class Parts(Image):
+    observation_space = gym.spaces.Dict(place=Vector.observation_space, lit=gym.spaces.Discrete(2))
+    def shown(self):
+        return {"place": Vector.shown(self), "lit": 1}
+"""
+
+
+@pytest.mark.parametrize(
+    ("env", "name"),
+    [
+        ("Image", "observation with [2, 3, 0]=255, [2, 3, 1]=255, [2, 3, 2]=255"),
+        ("Vector", "observation with [9]=1"),
+        ("Parts", "observation with place[9]=1"),
+    ],
+)
+def test_an_enumerated_state_is_named_by_what_it_shows(
+    env: str, name: str, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    (tmp_path / f"long_{env}.py").write_text(ENVS)
+    monkeypatch.syspath_prepend(tmp_path)
+    words = [
+        "agent=q_learning",
+        "tuned=none",
+        "observation=none",
+        "agent.initial_value=-1",
+        "total_timesteps=64",
+    ]
+    run = gridworld.train(f"env=long_{env}:{env}", *words, folder=tmp_path / "run", seed=0, progress=False)
+    mdp = run.evaluator.mdp
+    assert mdp.state_name(int(mdp.start_states[0])) == name
+    diagnose.main([str(tmp_path / "run"), "--trust"])
+    told = capsys.readouterr().out
+    assert "observation with " in told
+    assert not re.search(r"\bstate \d", told)
+    table = told[: told.index("Try, one at a time")].splitlines()[1:]
+    assert max(map(len, table)) <= 80
+
+
 def test_an_offer_has_the_steps_that_it_trains_and_about_its_time(tmp_path: Path, capsys) -> None:
     """Of PPO, which trains by whole rollouts, at first two of 32 steps in each of 16 environments."""
     words = ["agent=ppo", "n_envs=16", "agent.n_steps=32", "agent.batch_size=64", "total_timesteps=600"]
