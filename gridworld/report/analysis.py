@@ -123,6 +123,8 @@ _METRICS = (
     RunMetric("regret", "final regret", lambda run, _: run.regret, ("iqm", "median", "mean"), -1, True),
     RunMetric("steps", "steps until certified for good", lambda run, _: run.certified_since_step,
               ("iqm", "median"), -1, True),
+    RunMetric("first", "steps until the first certificate", lambda run, _: run.first_certified_step,
+              ("median",), -1),
     RunMetric("optimality", "optimality", _optimality, ("iqm", "mean")),
     *(RunMetric(metric.name, metric.label, _last(metric.name)) for metric in REPORTED),
     RunMetric("sampled_return", "sampled policy's return", _last(SAMPLED_RETURN)),

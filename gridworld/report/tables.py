@@ -24,12 +24,13 @@ _MINUS = "\N{MINUS SIGN}"
 # Signs with which a name out of a run's folder could be HTML, a link, a row, or the end of a marked place.
 _MARKS = re.compile(r"""[\\|<>&`\[\]*!\n\r]|:(?=//)|(?<=www)\.""")
 
-_SCORES = tuple(key for key in METRICS if key not in ("regret", "steps"))
+_SCORES = tuple(key for key in METRICS if key not in ("regret", "steps", "first"))
 _HEADINGS = {
     ("regret", "iqm"): "regret, IQM",
     ("regret", "median"): "regret, median",
     ("steps", "iqm"): "steps until certified for good, IQM",
     ("steps", "median"): "steps until certified for good, median",
+    ("first", "median"): "steps until the first certificate, median",
 }
 
 
@@ -168,7 +169,7 @@ def all_tables(report: Report) -> Iterator[Table]:
 
 def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
     """The main results on all tasks; also the table for a README. `reasons` are of runs not certified."""
-    shown = [("regret", "iqm"), ("steps", "median")]
+    shown = [("regret", "iqm"), ("steps", "median"), ("first", "median")]
     columns = ["task", "agent", "seeds certified", "ever certified", *(_HEADINGS[which] for which in shown)]
     columns += ["why not"] if reasons else []
     rows: list[list[Cell]] = []
@@ -218,7 +219,7 @@ def scores_table(task: TaskAnalysis) -> Table:
 def estimate(result: Result, key: str, statistic: str) -> IntervalCell | None:
     """A statistic of a metric as a cell; None where no run has the metric."""
     found = result.estimates.get((key, statistic))
-    form = steps_up_to(result.shortest_uncertified) if key == "steps" else number
+    form = steps_up_to(result.shortest_uncertified) if key in ("steps", "first") else number
     return None if found is None else IntervalCell(found, form)
 
 

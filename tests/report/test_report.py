@@ -1,6 +1,7 @@
 """From run folders to a report: grouping, bad input, and what is written."""
 
 import csv
+import io
 import itertools
 import json
 import logging
@@ -122,6 +123,34 @@ def test_real_runs_are_reported(tmp_path: Path) -> None:
     assert {row["seed"] for row in why} == {"0", "1"}
     assert all(int(row["to try"].removeprefix("total_timesteps=")) >= 2000 for row in why)
     assert "Why runs are not certified" in page
+
+
+def test_agents_are_ranked_by_since_when_they_are_certified_for_good(maker: Maker, tmp_path: Path) -> None:
+    """The early agent is certified at step 2,000, loses it at once, and has it again at 16,000."""
+    for seed in range(4):
+        maker.write(tmp_path / f"steady,{seed}", seed, 8000, agent__name="steady")
+        early = maker.write(tmp_path / f"early,{seed}", seed, 16000, agent__name="early")
+        rows = list(csv.DictReader(io.StringIO((early / "curve.csv").read_text())))
+        rows[2] |= {name: rows[16][name] for name in rows[2] if name != "step"}
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        change(early, "curve.csv", text.getvalue())
+    report = gather([tmp_path])
+    (task,) = report.tasks
+    assert [result.group.agent for result in task.ranked] == ["steady", "early"]
+    assert task.comparisons["steps", "steady", "early"].point == 1
+    for table in (tables.results_table(report.tasks, {}), tables.task_table(task)):
+        for row in table.rows:
+            cells = {key: tables.texts(cell)[0] for key, cell in zip(table.columns, row, strict=True)}
+            early = cells["agent"] == "early"
+            assert cells["steps until certified for good, median"] == ("16,000" if early else "8,000")
+            assert cells["steps until the first certificate, median"] == ("2,000" if early else "8,000")
+    page = (report_of(tmp_path) / "report.html").read_text()
+    assert "steady is certified optimal on all 4 seeds, for good since step 8,000" in page
+    assert "early is certified optimal on all 4 seeds, for good since step 16,000" in page
+    assert "Steps until certified for good" in page
 
 
 def test_reasons_are_asked_of_each_cell_before_the_second_of_any(
