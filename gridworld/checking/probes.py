@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from gridworld.world.chain import Chain
 from gridworld.world.evaluation import Evaluator, PolicySnapshot
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup, frozen
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.solver import solved
 
@@ -125,6 +125,18 @@ SLIPPERY = _world(
         [_sure(0, 0, GOES_ON), [(0.8, 2, 1.0, ENDS), (0.2, 1, 0.0, GOES_ON)]],
     ],
 )
+# Three parts, each with a start. From state 0, action 0 takes the longer way, three steps that cost 0.5 each,
+# action 1 the shorter one, which costs 1. From state 3, action 0 pays 1, action 1 leads to where 3 is paid.
+# From state 5, action 0 costs 5 and leads to where 1 is paid twice, action 1 ends.
+COSTS_AND_LARGE = _world(
+    "costs and large rewards",
+    [
+        *([_sure(1, -0.5, GOES_ON), _sure(8, -1, ENDS)], _any(2, -0.5, GOES_ON), _any(8, -0.5, ENDS)),
+        *([_sure(8, 1, ENDS), _sure(4, 0, GOES_ON)], _any(8, 3, ENDS)),
+        *([_sure(6, -5, GOES_ON), _sure(8, 0, ENDS)], _any(7, 1, GOES_ON), _any(8, 1, ENDS)),
+    ],
+    start=(0.75, 0.0, 0.0, 0.125, 0.0, 0.125),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +191,15 @@ def optimal(trained: Trained) -> str:
 def optimal_with_values(trained: Trained) -> str:
     """Both, if it shows its values."""
     return optimal(trained) if "values" in trained.unknown else f"{optimal(trained)}, {values(trained)}"
+
+
+def values_if_optimal(trained: Trained) -> str:
+    """Its values, which are of another policy where its own is not optimal."""
+    try:
+        optimal(trained)
+    except UnmetError:
+        raise UnknownError("not asked, its policy is not optimal") from None
+    return values(trained)
 
 
 def acts_as_learned(trained: Trained) -> str:
@@ -237,7 +258,7 @@ def _near(
     """Compare numbers of live states, or of these (S,) of them; says which is farthest from the exact one."""
     where = mdp.reachable & ~mdp.terminal & (True if states is None else states)
     where = np.broadcast_to(where.reshape(-1, *[1] * (exact.ndim - 1)), exact.shape)
-    largest = max(np.abs(exact[where]).max(), np.abs(mdp.reward).max())
+    largest = max(np.abs(exact[where]).max(initial=0), np.abs(mdp.reward[mdp.reachable]).max())
     tolerance = PROBABILITY if probability else TOLERANCE * largest
     error = np.where(where, np.abs(found - exact), -1.0)
     worst = tuple(int(each) for each in np.unravel_index(np.argmax(error), error.shape))
@@ -259,31 +280,41 @@ class Probe:
     gamma: float = 0.9  # that it trains with
     arguments: Mapping[str, Any] = field(default_factory=dict)  # that differ from `settings`
     needs: str = ""  # an argument; an algorithm that does not take it is not asked
+    starts: Sequence[int] = ()  # of its world, from which it asks; (): all
+    follows: Sequence[str] = ()  # earlier probes whose failure may be the cause of a failure
 
     @property
     def training(self) -> tuple[str, float, str]:
         """Probes with the same one share a training run."""
         return self.world.digest(), self.gamma, repr(self.arguments)
 
+    def found(self, trained: Trained) -> str:
+        """What was found where it holds; raises `UnmetError`, or `UnknownError`."""
+        mdp = trained.mdp
+        if self.starts:
+            start = np.zeros(mdp.num_states)
+            start[list(self.starts)] = 1 / len(self.starts)
+            trained = replace(trained, mdp=replace(mdp, start=frozen(start)))
+        return self.holds(trained)
+
 
 _NO_EXPLORATION_LEFT = {"exploration_final_eps": 0.0}
+_BASIC = ("choice", "context", "termination", "discount")  # what worlds of several steps rest on
 
 # fmt: off
 PROBES = (
     Probe("constant", CONSTANT, values,
-          "values are not learned at all: check the loss, the optimiser and the reward that reaches it"),
-    Probe("discount", CORRIDOR, optimal_with_values,
-          "gamma is ignored or applied at the wrong step, or a reward is credited to another step",
-          gamma=0.5, needs="gamma"),
+          "values are not learned at all: check the loss, the optimiser and the reward that reaches it; too "
+          "large, they are bootstrapped past the end of an episode"),
     Probe("choice", BANDIT, optimal,
           "worse actions are preferred: the advantage's sign is wrong, or rewards go to the wrong actions"),
     Probe("context", TWO_CONTEXTS, optimal,
           "the policy does not depend on the state: observations are lost, mixed up or from another step",
-          arguments=_NO_EXPLORATION_LEFT),
+          arguments=_NO_EXPLORATION_LEFT, follows=("choice",)),
     Probe("behaviour", TWO_CONTEXTS, acts_as_learned,
           "it does not act as it has learned: exploration ends late or never, or acting and learning see "
           "different observations",
-          arguments=_NO_EXPLORATION_LEFT),
+          arguments=_NO_EXPLORATION_LEFT, follows=("choice", "context")),
     Probe("layers", TWO_CONTEXTS, all_layers_learn,
           "a layer never changes: the optimiser lacks it, it gets no gradient or it is never copied",
           arguments=_NO_EXPLORATION_LEFT),
@@ -291,28 +322,49 @@ PROBES = (
           "it explores less than its epsilon says: epsilon is ignored, scaled or starts elsewhere",
           arguments={"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0},
           needs="exploration_final_eps"),
-    Probe("entropy", DEAR_CONTEXTS, soft_optimal,
-          "the entropy bonus does not match its coefficient: wrong sign or scale, missing, or not of each "
-          "state's policy",
-          arguments={"ent_coef": BONUS}, needs="ent_coef"),
-    Probe("delay", DELAY, optimal_with_values,
-          "credit does not reach earlier steps: returns, traces or next observations are off by a step"),
     Probe("termination", END_LIKE_THE_START, optimal_with_values,
-          "values are bootstrapped past the end of an episode: the terminal flag is ignored"),
-    Probe("truncation", CUT_SHORT, optimal_with_values,
-          "a step limit is treated as termination: the value of the last state is missing",
-          gamma=0.8),
+          "values are bootstrapped past the end of an episode: the terminal flag is ignored",
+          gamma=0.95, follows=("choice", "context")),
+    Probe("entropy", DEAR_CONTEXTS, soft_optimal,
+          "the entropy bonus does not match its coefficient (wrong sign or scale, missing, or not of each "
+          "state's policy), or advantages leak from one episode into another",
+          arguments={"ent_coef": BONUS}, needs="ent_coef", follows=("choice", "context", "termination")),
+    Probe("discount", CORRIDOR, optimal_with_values,
+          "gamma is ignored or applied at the wrong step, or a reward is credited to another step",
+          gamma=0.5, needs="gamma", follows=("choice", "context", "termination")),
+    Probe("truncation", CUT_SHORT, optimal,
+          "a step limit is treated as termination: the value of the last state is missing, or hidden by what "
+          "leaks from the next episode",
+          gamma=0.8, follows=("choice", "context", "termination")),
+    Probe("leak", CUT_SHORT, values_if_optimal,
+          "values or advantages leak from one episode into another: after a step limit, the next episode's "
+          "count as if it continued this one",
+          gamma=0.8, follows=("termination", "discount")),
+    Probe("delay", DELAY, optimal_with_values,
+          "credit does not reach earlier steps: returns, traces or next observations are off by a step",
+          follows=("choice", "context", "discount")),
     Probe("stochastic", GAMBLE, optimal_with_values,
-          "it does not learn the mean of a random reward, but an extreme, its median or its last draw"),
+          "it does not learn the mean of a random reward, but an extreme, its median or its last draw",
+          follows=("choice", "termination")),
     Probe("alternation", ALTERNATION, optimal_with_values,
           "the value of the next state is wrong: another state's, or not that of its best action",
-          gamma=0.8),
+          gamma=0.8, follows=(*_BASIC, "truncation", "leak", "delay")),
     Probe("trap", TRAP, optimal_with_values,
-          "the next reward counts for more than the return: later rewards are not added, or costs are lost"),
+          "the next reward counts for more than the return: later rewards are not added, or costs are lost",
+          follows=(*_BASIC, "delay")),
+    Probe("costs", COSTS_AND_LARGE, optimal_with_values,
+          "values below 0 are lost (the largest is searched from 0, the output is never negative, or targets "
+          "are cut off at 0), or rewards are shifted",
+          starts=(0,), follows=(*_BASIC, "delay", "trap")),
+    Probe("large", COSTS_AND_LARGE, optimal_with_values,
+          "rewards or targets beyond 1 are changed: clipped, replaced by their sign, or normalised",
+          starts=(3, 5), follows=(*_BASIC, "delay", "trap", "costs")),
     Probe("slip", SLIPPERY, optimal_with_values,
-          "random transitions are not averaged over, or next states are wrong"),
+          "random transitions are not averaged over, or next states are wrong",
+          follows=(*_BASIC, "delay", "stochastic", "alternation")),
     Probe("target", ENDLESS, first_backup,
           "targets are not computed with the target network: it is never updated, or lags behind",
-          gamma=0.8, arguments={"target_update_interval": 10_000_000}, needs="target_update_interval"),
+          gamma=0.8, arguments={"target_update_interval": 10_000_000}, needs="target_update_interval",
+          follows=("discount", "truncation")),
 )
 # fmt: on

@@ -39,15 +39,23 @@ class Finding:
     meaning: str  # what a failure means
     seeds: int = 1  # how many seeds it was trained on
     seconds: float = 0.0  # that this took, shared by the probes that look at the same training run
+    may_follow_from: tuple[str, ...] = ()  # probes that failed too, which may be the cause
+
+    @property
+    def advice(self) -> list[str]:
+        """What a failure means, and what to mend first; nothing unless it failed after training."""
+        if self.passed is not False or self.found.startswith(_BROKEN):
+            return []
+        mend = "that" if len(self.may_follow_from) == 1 else "these"
+        first = f"may follow from {' or '.join(self.may_follow_from)}; mend {mend} first"
+        return [self.meaning, first] if self.may_follow_from else [self.meaning]
 
     def __str__(self) -> str:
-        """A row of the table, and below it what a failure means."""
+        """A row of the table, and below it the advice."""
         seeds = "" if self.seeds == 1 else f" ({self.seeds} seeds)"
         cells = [self.name, _WORDS[self.passed], f"{self.seconds:.1f} s", f" {self.found}{seeds}"]
-        (line,) = aligned([cells], ("<12", "<7", ">7", "<0"))
-        if self.passed is False and not self.found.startswith(_BROKEN):
-            line += "\n" + textwrap.indent(textwrap.fill(self.meaning, _WIDTH), " " * 4)
-        return line
+        below = [textwrap.indent(textwrap.fill(each, _WIDTH), " " * 4) for each in self.advice]
+        return "\n".join([*aligned([cells], ("<12", "<7", ">7", "<0")), *below])
 
 
 @dataclass(frozen=True)
@@ -148,10 +156,14 @@ def check(
     findings: list[Finding] = []
     check_group = partial(_check_group, config, given, seed, steps)
     with ProcessPoolExecutor(max(1, min(processes, len(groups))), get_context("spawn")) as pool:
-        for group in (map if processes == 1 else pool.map)(check_group, groups):
-            findings += group
-            for finding in group:
-                on_finding(finding)
+        results = itertools.chain.from_iterable((map if processes == 1 else pool.map)(check_group, groups))
+        for probe, finding in zip(chosen, results, strict=True):
+            if finding.passed is False:
+                roots = {each.name for each in findings if each.passed is False and not each.may_follow_from}
+                causes = tuple(name for name in probe.follows if name in roots)
+                finding = replace(finding, may_follow_from=causes)
+            findings.append(finding)
+            on_finding(finding)
     return CheckResult(config.name, tuple(findings), time.monotonic() - started)
 
 
@@ -207,7 +219,7 @@ def _once(
     outcomes: Outcomes = []
     for probe in probes:
         try:
-            outcomes.append((True, probe.holds(trained)))
+            outcomes.append((True, probe.found(trained)))
         except UnmetError as unmet:
             outcomes.append((False, str(unmet)))
         except UnknownError as unknown:

@@ -4,6 +4,7 @@ CI plants a few bugs; GRIDWORLD_BUGS=all python -m pytest tests/checking plants 
 """
 
 import dataclasses
+import itertools
 import os
 
 import numpy as np
@@ -26,7 +27,7 @@ from gridworld.world.solver import solved
 PLANT_ALL = os.environ.get("GRIDWORLD_BUGS") == "all"
 FEW = [
     *(bugs.WrongSign, bugs.NoTargetNetwork, bugs.ReplayOffByOne, bugs.PPOEntropySign),
-    bugs.EpsilonStaysAtTenth,
+    *(bugs.EpsilonStaysAtTenth, bugs.PPORewardsClipped, bugs.DQNNeverNegative),
 ]
 BY_NAME = {probe.name: probe for probe in PROBES}
 
@@ -47,7 +48,7 @@ def test_a_planted_bug_fails_its_probe(kind: type) -> None:
     ("kind", "name", "expected"),
     [
         *[(DQN, "target", True), (DQN, "exploration", True), (PPO, "behaviour", True)],
-        *[(PPO, "entropy", True), ("dqn", "alternation", True)],
+        *[(PPO, "entropy", True), ("dqn", "alternation", True), (PPO, "costs", True), (DQN, "large", True)],
         # Of what an algorithm does not take nothing is asked.
         *[(PPO, "target", None), (A2C, "exploration", None), (DQN, "entropy", None)],
         ("sb3_contrib.TRPO", "entropy", None),
@@ -205,6 +206,11 @@ VALUES = [  # a world, a discount, and Q* of its live states
     (expect.GAMBLE, 0.9, [[0.1, 0.4]]),
     (expect.ALTERNATION, 0.8, [[0.8**2 / 0.36, 0.8 / 0.36], [0.8 / 0.36, 1 / 0.36]]),
     (expect.TRAP, 0.9, [[0.2, 0.7], [0, 1]]),
+    (
+        expect.COSTS_AND_LARGE,
+        0.9,
+        [[-1.355, -1], [-0.95] * 2, [-0.5] * 2, [1, 2.7], [3] * 2, [-3.29, 0], [1.9] * 2, [1] * 2],
+    ),
 ]
 
 
@@ -218,4 +224,11 @@ def test_worlds_are_what_they_are_for() -> None:
     assert solved(expect.SLIPPERY, 0.9).q[1, 1] == pytest.approx(0.8 / 0.82)
     assert expect.END_LIKE_THE_START.number.tolist() == [0, 1, 0, 0]  # its ends look like a live state
     assert (expect.ENDLESS.max_episode_steps, expect.ENDLESS.terminal.any()) == (5, False)
-    assert len({probe.name for probe in PROBES}) == len(PROBES)
+    names = [probe.name for probe in PROBES]
+    assert len(set(names)) == len(names)
+    for number, probe in enumerate(PROBES):
+        assert set(probe.follows) <= set(names[:number]), probe.name  # it is known when it is printed
+    trained_on = [probe.training for probe in PROBES]
+    assert len(list(itertools.groupby(trained_on))) == len(
+        set(trained_on)
+    )  # those that share one are adjacent

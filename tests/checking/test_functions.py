@@ -146,6 +146,7 @@ CAUGHT = {
     ("ppo", "dones"): "termination",
     ("ppo", "gamma"): "discount",
     ("ppo", "truncated"): "truncation",
+    ("ppo", "leak"): "leak",
 }
 STEPS = {"dqn": 2000, "ppo": 3000}
 
@@ -166,6 +167,69 @@ def test_a_bug_in_them_is_found(kind: str, bug: str) -> None:
     train, probe = partial(getattr(cleanrl, kind), bug=bug), BY_NAME[CAUGHT[kind, bug]]
     [(passed, text)] = run._once(subject(train, "one_hot"), {}, 0, [probe], STEPS[kind])
     assert passed is False, text
+
+
+def q_learning(env: Any, steps: int, seed: int, gamma: float, bug: str) -> np.ndarray:
+    """Q-learning, Q by states and actions."""
+    rng = np.random.default_rng(seed)
+    q = np.zeros((env.observation_space.n, env.action_space.n))
+    visits, state, mean = np.zeros_like(q), env.reset(seed=seed)[0], 0.0
+    for step in range(steps):
+        explores = rng.random() < max(0.1, 1 - 2 * step / steps)
+        action = int(rng.integers(q.shape[1]) if explores else q[state].argmax())
+        following, reward, terminated, truncated, _ = env.step(action)
+        mean += (reward - mean) / (step + 1)
+        if bug == "rewards":
+            reward = np.clip(reward, -1, 1)
+        if bug == "mean":
+            reward -= mean
+        over = terminated or (truncated and bug == "limits")
+        best = max(0.0, q[following].max()) if bug == "best" else q[following].max()
+        target = reward + (0.0 if over else gamma * best)
+        if bug == "targets":
+            target = max(0.0, target)
+        visits[state, action] += 1
+        q[state, action] += 10 / (10 + visits[state, action]) * (target - q[state, action])
+        state = env.reset()[0] if terminated or truncated else following
+    return q
+
+
+@pytest.mark.parametrize(
+    ("bug", "failed"),
+    [
+        *[("", []), ("best", ["costs"]), ("rewards", ["large"]), ("mean", ["costs"])],
+        ("targets", ["costs", "large"]),
+    ],
+)
+def test_values_below_0_and_rewards_beyond_1(bug: str, failed: list[str]) -> None:
+    """By its policy alone, too, of a learner that takes no discount."""
+    result = gridworld.check(
+        lambda env, steps, seed: q_learning(env, steps, seed, 0.95, bug).argmax(axis=1),
+        probes=["trap", "costs", "large"],
+    )
+    assert result.failed == failed, str(result)
+    result = gridworld.check(
+        lambda env, steps, seed, gamma: {"q": q_learning(env, steps, seed, gamma, bug)},
+        probes=["trap", "costs", "large"],
+    )
+    assert set(failed) <= set(result.failed), str(result)
+
+
+def test_a_bug_is_blamed_once() -> None:
+    result = gridworld.check(
+        lambda env, steps, seed, gamma: {"q": q_learning(env, steps, seed, gamma, "limits")},
+        probes=["truncation", "leak", "delay", "alternation"],
+    )
+    assert result.failed == ["truncation", "alternation"]
+    by_name = {finding.name: finding for finding in result.findings}
+    assert by_name["truncation"].may_follow_from == ()
+    assert by_name["leak"].found == "not asked, its policy is not optimal"
+    assert str(by_name["alternation"]).endswith("\n    may follow from truncation; mend that first")
+    alone = gridworld.check(
+        lambda env, steps, seed, gamma: {"q": q_learning(env, steps, seed, gamma, "limits")},
+        probes=["alternation"],
+    )
+    assert "may follow" not in str(alone)
 
 
 PLUGIN = """

@@ -140,7 +140,7 @@ def ppo(
     ent_coef: float = 0.01,
     bug: str = "",
 ) -> dict[str, Any]:
-    """ppo.py. Bugs: sign, dones, gamma; and truncated, which is ppo.py's own."""
+    """ppo.py. Bugs: sign, dones, gamma, leak; and truncated, which is ppo.py's own."""
     learning_rate, num_steps, num_minibatches, update_epochs = 2.5e-3, 128, 4, 4
     gae_lambda, clip_coef, vf_coef, max_grad_norm = 0.95, 0.2, 0.5, 0.5
     envs = vector(env, seed)
@@ -161,10 +161,11 @@ def ppo(
                 action, logprob, _, value = agent.get_action_and_value(next_obs)
             values[step], actions[step], logprobs[step] = value.flatten(), action, logprob
             new_obs, reward, terminations, truncations, infos = envs.step(action.numpy())
-            if truncations[0] and bug != "truncated":
+            if truncations[0] and bug not in ("truncated", "leak"):
                 with torch.no_grad():
                     reward = reward + gamma * agent.critic(torch.Tensor(infos["final_obs"][0])).numpy()
-            next_done = torch.Tensor(np.logical_or(terminations, truncations))
+            over = np.logical_or(terminations, truncations)
+            next_done = torch.Tensor(terminations if bug == "leak" else over)
             rewards[step] = torch.tensor(reward).view(-1)
             next_obs = torch.Tensor(new_obs)
 

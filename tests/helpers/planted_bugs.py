@@ -151,6 +151,17 @@ def _average_targets(model: Any) -> None:
     model.q_net_target.forward = averaged
 
 
+def _targets_from_zero(model: Any) -> None:
+    forward = model.q_net_target.forward
+    model.q_net_target.forward = lambda obs: forward(obs).clamp(min=0)
+
+
+def _never_negative(_: Any, make: Callable[..., Any]) -> Any:
+    net = make()
+    net.q_net.append(torch.nn.Softplus())
+    return net
+
+
 def _bonus_times(factor: float) -> Patch:
     return _during(ent_coef=lambda model: factor * model.ent_coef)
 
@@ -204,6 +215,14 @@ _bug(
     "PPOFrozenLayer", PPO, "The first layer of the policy has no gradient.", "layers",
     _setup_model=_then(lambda model: model.policy.mlp_extractor.policy_net[0].requires_grad_(False)),
 )
+_buffer_bug(
+    "PPORewardsClipped", PPO, "Rewards are clipped to [-1, 1].", "large",
+    add=_stores(reward=lambda _, step: np.clip(step["reward"], -1, 1)),
+)
+_buffer_bug(
+    "PPOReturnsFromZero", PPO, "Returns are cut off at 0.", "costs",
+    compute_returns_and_advantage=_after(returns=lambda buffer: np.maximum(buffer.returns, 0)),
+)
 _bug(
     "PPONoValueLoss", PPO, "The loss of the value has no weight.", "constant",
     train=_during(vf_coef=lambda _: 0.0),
@@ -247,6 +266,15 @@ _buffer_bug(
     "CostsLost", DQN, "Negative rewards are cut off.", "trap",
     add=_stores(reward=lambda _, step: np.maximum(step["reward"], 0.0)),
 )
+_buffer_bug(
+    "DQNRewardsClipped", DQN, "Rewards are clipped to [-1, 1].", "large",
+    add=_stores(reward=lambda _, step: np.clip(step["reward"], -1, 1)),
+)
+_bug(
+    "DQNBestFromZero", DQN, "The best next value is searched from 0.", "costs",
+    _setup_model=_then(_targets_from_zero),
+)
+_policy_bug("DQNNeverNegative", DQN, "Its values are never negative.", "costs", make_q_net=_never_negative)
 _bug(
     "DQNGammaForgotten", DQN, "Its discount is always 0.99.", "discount",
     train=_during(gamma=lambda _: 0.99),
