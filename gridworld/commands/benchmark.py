@@ -15,7 +15,7 @@ from gridworld.base.atomic_write import write_json
 from gridworld.base.console import program
 from gridworld.base.errors import InputError
 from gridworld.commands import parser_of
-from gridworld.run.folder import check_inside, check_writable
+from gridworld.run.folder import check_file, check_inside
 
 _DOCS = Path(__file__).resolve().parents[2] / "docs"  # where the measurements are, in the source
 # By the table's name on the command line: its module, imported where it is asked for.
@@ -27,11 +27,7 @@ def main(arguments: Sequence[str]) -> None:
     """Print the tables as they are measured, and write them as JSON."""
     options = _parser().parse_args(arguments)
     check_inside(options.out, "--out")
-    if not options.out.parent.is_dir():
-        raise InputError(f"--out {options.out}: no such folder {options.out.parent}")
-    if options.out.is_dir():
-        raise InputError(f"--out {options.out}: is a folder; name a file in it")
-    check_writable(options.out.parent, "--out")
+    check_file(options.out, "--out")
     if not (_DOCS / "benchmarks").is_dir():
         raise InputError(f"{program('benchmark')}: needs docs/benchmarks of a source checkout")
     sys.path.insert(0, str(_DOCS))

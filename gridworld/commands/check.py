@@ -13,6 +13,7 @@ import textwrap
 from collections.abc import Sequence
 
 from gridworld.base.console import printable
+from gridworld.checking.files import add_file_options, check_files, write_files
 from gridworld.checking.function import OBSERVATIONS
 from gridworld.checking.probes import PROBES
 from gridworld.checking.run import check
@@ -26,6 +27,7 @@ _FAILED = 1  # the exit code
 def main(words: Sequence[str]) -> None:
     """Print a row per probe as it ends, and the verdict."""
     options = _parser().parse_args(words)
+    check_files(options)
     result = check(
         options.algorithm,
         arguments(options.set),
@@ -38,6 +40,7 @@ def main(words: Sequence[str]) -> None:
         on_finding=lambda finding: print(*map(printable, str(finding).splitlines()), sep="\n", flush=True),
     )
     print(printable(result.verdict()))
+    write_files(result, options)
     if not result.passed:
         sys.exit(_FAILED)
 
@@ -63,4 +66,5 @@ def _parser() -> argparse.ArgumentParser:
     option("--seed", type=whole(0), default=0, help="the first of up to three seeds (default 0)")
     processes = min(_PROCESSES, os.cpu_count() or 1)
     option("--processes", type=whole(1), default=processes, help="how many runs train at a time")
+    add_file_options(parser)
     return parser

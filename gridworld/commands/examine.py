@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 from gridworld.base.console import printable
 from gridworld.checking.examine import examine
+from gridworld.checking.files import add_file_options, check_files, write_files
 from gridworld.commands import parser_of, whole
 
 _FOUND = 1  # the exit code
@@ -19,8 +20,10 @@ _FOUND = 1  # the exit code
 def main(words: Sequence[str]) -> None:
     """Print the page."""
     options = _parser().parse_args(words)
+    check_files(options)
     result = examine(options.env, options.gamma, steps=options.steps, seed=options.seed)
     print(*map(printable, str(result).splitlines()), sep="\n")
+    write_files(result, options)
     if not result.passed:
         sys.exit(_FOUND)
 
@@ -32,4 +35,5 @@ def _parser() -> argparse.ArgumentParser:
     option("--gamma", type=float, default=0.99, help="the discount that an agent will have (default 0.99)")
     option("--steps", type=whole(100), default=20_000, help="how many steps to sample (default 20000)")
     option("--seed", type=whole(0), default=0, help="of all that is drawn (default 0)")
+    add_file_options(parser)
     return parser

@@ -131,6 +131,16 @@ def check_writable(folder: Path, key: str) -> None:
         raise InputError(f"{folder}: cannot be written, {existing} is read-only; choose another {key}")
 
 
+def check_file(path: Path, key: str) -> None:
+    """Refuse a file whose folder is not there or cannot be written to, or whose place something else has."""
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{key} {path}: no such folder {path.parent}")
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        what = "folder" if path.is_dir() else "link" if path.is_symlink() else "device"
+        raise InputError(f"{key} {path}: is a {what}; name a file")
+    check_writable(path.absolute().parent, key)
+
+
 @contextlib.contextmanager
 def alone_in(folder: Path, wait: float = 0) -> Iterator[None]:
     """Hold a folder for this process, and remove what one that died has left half written.
