@@ -72,7 +72,8 @@ class SingleEnv(gym.Env[Any, Any]):
         seed: int = 0,
         on_step: Hook = lambda steps: 0,
     ) -> None:
-        self._envs, self._table, self._on_step = envs, table, on_step
+        self._envs, self._on_step = envs, on_step
+        self._rows = table.rows(np.arange(envs.mdp.num_states))  # by state; a look-up for each step is slower
         envs.reset(seed=seed)
         self.np_random = envs.np_random
         self.observation_space = table.space
@@ -86,7 +87,7 @@ class SingleEnv(gym.Env[Any, Any]):
         self._envs.np_random = self.np_random
         states, _ = self._envs.reset()
         self._is_over = False
-        return self._table.rows(states)[0], {}
+        return self._rows[states[0]].copy(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if self._is_over:
@@ -96,7 +97,7 @@ class SingleEnv(gym.Env[Any, Any]):
         self._on_step(self._steps)
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         self._is_over = terminated or truncated
-        return self._table.rows(step.reached)[0], float(step.rewards[0]), terminated, truncated, {}
+        return self._rows[step.reached[0]].copy(), float(step.rewards[0]), terminated, truncated, {}
 
 
 class FunctionAgent:

@@ -127,13 +127,13 @@ SLIPPERY = _world(
 )
 # Three parts, each with a start. From state 0, action 0 takes the longer way, three steps that cost 0.5 each,
 # action 1 the shorter one, which costs 1. From state 3, action 0 pays 1, action 1 leads to where 3 is paid.
-# From state 5, action 0 costs 5 and leads to where 1 is paid twice, action 1 ends.
+# From state 5, action 0 costs 5 and leads to where 1 is paid, action 1 costs 1 and ends.
 COSTS_AND_LARGE = _world(
     "costs and large rewards",
     [
-        *([_sure(1, -0.5, GOES_ON), _sure(8, -1, ENDS)], _any(2, -0.5, GOES_ON), _any(8, -0.5, ENDS)),
-        *([_sure(8, 1, ENDS), _sure(4, 0, GOES_ON)], _any(8, 3, ENDS)),
-        *([_sure(6, -5, GOES_ON), _sure(8, 0, ENDS)], _any(7, 1, GOES_ON), _any(8, 1, ENDS)),
+        *([_sure(1, -0.5, GOES_ON), _sure(7, -1, ENDS)], _any(2, -0.5, GOES_ON), _any(7, -0.5, ENDS)),
+        *([_sure(7, 1, ENDS), _sure(4, 0, GOES_ON)], _any(7, 3, ENDS)),
+        *([_sure(6, -5, GOES_ON), _sure(7, -1, ENDS)], _any(7, 1, ENDS)),
     ],
     start=(0.75, 0.0, 0.0, 0.125, 0.0, 0.125),
 )

@@ -135,9 +135,10 @@ def check_file(path: Path, key: str) -> None:
     """Refuse a file whose folder is not there or cannot be written to, or whose place something else has."""
     if not path.absolute().parent.is_dir():
         raise InputError(f"{key} {path}: no such folder {path.parent}")
+    if path.is_dir():
+        raise InputError(f"{key} {path}: is a folder; name a file in it")
     if path.is_symlink() or (path.exists() and not path.is_file()):
-        what = "folder" if path.is_dir() else "link" if path.is_symlink() else "device"
-        raise InputError(f"{key} {path}: is a {what}; name a file")
+        raise InputError(f"{key} {path}: is not a plain file; choose another")
     check_writable(path.absolute().parent, key)
 
 
