@@ -153,14 +153,14 @@ def check(
             build(first[0], chosen[0].world, first[1].num_envs, seed)
         except InputError as error:
             raise InputError(str(error).replace("agent.arguments.", "--set ")) from None
-    findings: list[Finding] = []
+    findings, follows = list[Finding](), {probe.name: probe.follows for probe in chosen}
     check_group = partial(_check_group, config, given, seed, steps)
     with ProcessPoolExecutor(max(1, min(processes, len(groups))), get_context("spawn")) as pool:
         results = itertools.chain.from_iterable((map if processes == 1 else pool.map)(check_group, groups))
-        for probe, finding in zip(chosen, results, strict=True):
+        for finding in results:
             if finding.passed is False:
                 roots = {each.name for each in findings if each.passed is False and not each.may_follow_from}
-                causes = tuple(name for name in probe.follows if name in roots)
+                causes = tuple(name for name in follows[finding.name] if name in roots)
                 finding = replace(finding, may_follow_from=causes)
             findings.append(finding)
             on_finding(finding)
