@@ -79,7 +79,7 @@ IN_TURN = {
 # What takes more than ten seconds of a processor, the longest first.
 LONG = (
     *("clusters", "tests/test_docs.py", "sources/test_chance.py", "commands/test_hostile_runs.py"),
-    *("grading/test_course.py", "checking/test_functions.py", "docs/test_examples.py"),
+    *("course/test_course.py", "checking/test_functions.py", "docs/test_examples.py"),
     *("diagnosis/test_sabotage.py", "api/test_certificates.py", "config/test_recipe_rule.py"),
     *("sweep/test_sweep_population.py", "sweep/test_sweep.py", "sources/test_enumerated.py"),
     *("tune/test_tune.py", "browsers", "playground", "config/test_recipes.py", "tune/test_tune_parts.py"),
@@ -91,7 +91,7 @@ LONG = (
     "commands/test_train_on_worlds.py",
     *("export/test_export.py", "training/test_training.py"),
     *("agents/sb3/test_custom_code.py", "engine/test_updates.py", "restore/test_resume_states.py"),
-    *("commands/test_console.py", "docs/test_site.py", "grading/test_grade.py"),
+    *("commands/test_console.py", "docs/test_site.py", "course/test_grade.py"),
     *("agents/tabular/test_tabular.py", "process/test_forks.py", "api/test_runs.py", "api/test_sweeps.py"),
 )
 

@@ -34,7 +34,6 @@ COMMANDS = {
     "tune": "tune an agent's settings for a task, and confirm the winner",
     "check": "check an algorithm's implementation on worlds with known answers",
     "examine": "examine an environment: why nothing learns in it",
-    "grade": "mark a student's lab sheet of the course",
     "play": "play a world yourself, next to a trained agent if you like",
     "playground": "draw worlds and watch tables learn, in the browser",
     "benchmark": "measure the speed of this project and its peers",
@@ -162,8 +161,8 @@ def _without_command(words: Sequence[str]) -> None:
         return
     close = difflib.get_close_matches(word.removesuffix(".py"), COMMANDS, n=1)
     advice = f"did you mean {CONSOLE} {close[0]}?" if close else f"it is one of {', '.join(COMMANDS)}"
-    if word == "sweep":
-        advice = f"a sweep is {CONSOLE} train -m"
     if not close and "=" in word:
         advice = f"settings come after a command: {CONSOLE} train {word}"
+    course = "marking is a script of the course: python docs/course/grade.py"
+    advice = {"sweep": f"a sweep is {CONSOLE} train -m", "grade": course}.get(word, advice)
     raise InputError(f"{CONSOLE}: unknown command {word}; {advice}")

@@ -57,6 +57,7 @@ def test_help_version_and_words_that_are_no_command(
         ("trian", "did you mean gridworld train?"),
         ("evaluate.py", "did you mean gridworld evaluate?"),
         ("agent=dqn", "settings come after a command: gridworld train agent=dqn"),
+        ("grade", "marking is a script of the course: python docs/course/grade.py"),
         ("x\x1b[1m", f"it is one of {', '.join(COMMANDS)}"),
     ):
         out, errors = told(word, code=2)

@@ -165,8 +165,9 @@ class Reader:
             command = [reads, *words, "--inspect"]  # reads the same, and ends
             return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, timeout=300)
         assert program == "python"
-        if words[0] == "-I":  # by Python alone
-            command = [sys.executable, "-I", str(ROOT / words[1]), *words[2:]]
+        if words[0].startswith(("-I", "docs/")):  # by Python alone; not a command
+            words = [str(ROOT / word) if word.startswith(("docs/", "scripts/")) else word for word in words]
+            command = [sys.executable, *words]
             return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, timeout=300)
         words[0] = words[0].removeprefix("scripts/")
         claims = self._claims_of(line)

@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 
 import numpy as np
+from grading import Work, WrongAnswerError, exercise, numbers
 
 from gridworld import Evaluator, Mdp, compile_mdp
-from gridworld.grading import Work, WrongAnswerError, exercise, numbers
 from gridworld.world.chain import Chain
 from gridworld.world.layout import parse
 from gridworld.world.mdp import backup

@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 
 import numpy as np
+from grading import Work, WrongAnswerError, exercise
 
 import gridworld
 from gridworld import Evaluator, InputError, Mdp, compile_mdp
-from gridworld.grading import Work, WrongAnswerError, exercise
 from gridworld.world.chain import Chain
 from gridworld.world.layout import classic, parse
 from gridworld.world.mdp import backup

@@ -4,12 +4,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from grading import Work, WrongAnswerError, exercise, numbers
+from grading.sheet import read_cells
+
 import gridworld
 from gridworld import Mdp
 from gridworld.checking.probes import CONSTANT
 from gridworld.checking.run import CheckResult
-from gridworld.grading import Work, WrongAnswerError, exercise, numbers
-from gridworld.grading.sheet import read_cells
 
 STEPS = 1500  # as in the sheet
 SHEET = Path(__file__).parents[1] / f"{Path(__file__).stem}.ipynb"

@@ -1,17 +1,18 @@
-"""`gridworld grade` on a sheet of two exercises: what a notebook may do, and that it ends in its time."""
+"""`grade.py` of the course on a sheet of two exercises: what notebooks may do, and that it ends in its time."""
 
 import json
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
-from helpers.support import script
-
-from gridworld.grading.sheet import grade
-from gridworld.grading.work import Work, WrongAnswerError
+from grading.sheet import grade
+from grading.work import Work, WrongAnswerError
+from helpers.support import ROOT
 
 MARKING = """
-from gridworld.grading import Work, WrongAnswerError, exercise
+from grading import Work, WrongAnswerError, exercise
 
 @exercise("1 one", points=1)
 def one(work):
@@ -83,6 +84,11 @@ NO_NUMBERS = (
 )
 
 
+def grade_py(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(ROOT / "docs" / "course" / "grade.py"), *words]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120)
+
+
 def notebook(folder: Path, *cells: str) -> Path:
     (folder / "marking").mkdir(exist_ok=True)
     (folder / "marking" / "sheet.py").write_text(MARKING)
@@ -145,27 +151,27 @@ def test_a_cell_that_fails_is_named_and_costs_no_others(tmp_path: Path) -> None:
 
 def test_the_command(tmp_path: Path) -> None:
     mine = notebook(tmp_path, TWO)
-    done = script("grade.py", "sheet.ipynb", str(mine), cwd=tmp_path)
+    done = grade_py("sheet.ipynb", str(mine), cwd=tmp_path)
     assert (done.returncode, done.stderr) == (1, "")
     one, two, total = done.stdout.splitlines()
     assert one.split(maxsplit=3) == ["1", "one", "0/1", "`one` is not in the notebook"]
     assert two.split() == ["2", "two", "2/2", "right"]
     assert total == "total: 2 of 3 points"
     notebook(tmp_path, TWO, "def one():\n    return 'hidden'")
-    assert script("grade.py", "sheet.ipynb", str(mine), cwd=tmp_path).returncode == 0
+    assert grade_py("sheet.ipynb", str(mine), cwd=tmp_path).returncode == 0
     for words, told in (
         (["5", "mine.ipynb"], "error: 5: not a lab sheet; must be from 1 to "),
         (["other.ipynb", "mine.ipynb"], "other.py: missing; the marking of other.ipynb must be in this file"),
         (["sheet.ipynb", "no.ipynb"], "has no no.ipynb"),
         (["sheet.ipynb", "marking/sheet.py"], "is not JSON"),
     ):
-        done = script("grade.py", *words, cwd=tmp_path)
+        done = grade_py(*words, cwd=tmp_path)
         assert (done.returncode, done.stdout) == (2, "")
         assert told in done.stderr
     notebook(tmp_path, TWO, 5)  # type: ignore[arg-type]
-    done = script("grade.py", "sheet.ipynb", "mine.ipynb", cwd=tmp_path)
+    done = grade_py("sheet.ipynb", "mine.ipynb", cwd=tmp_path)
     assert (done.returncode, "has a code cell whose source is not text" in done.stderr) == (2, True)
     (tmp_path / "marking" / "sheet.py").write_text("1 / 0")
-    done = script("grade.py", "sheet.ipynb", "mine.ipynb", cwd=tmp_path)
+    done = grade_py("sheet.ipynb", "mine.ipynb", cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "sheet.py: cannot be run (ZeroDivisionError: division by zero)" in done.stderr

@@ -13,8 +13,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gridworld.base.console import aligned, printable
-from gridworld.commands import parser_of, whole
-from gridworld.grading.sheet import find_sheet, grade
+from gridworld.base.signals import listen
+
+if __name__ == "__main__":
+    listen()  # before what takes time to import
+
+from grading.sheet import find_sheet, grade
+
+from gridworld.commands import parser_of, run, whole
 
 _NOT_ALL = 1  # the exit code
 _COLUMNS = ("<34", ">7", "<0")
@@ -39,9 +45,14 @@ def main(words: Sequence[str]) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("grade", __doc__)
+    parser.prog = "grade.py"
     option = parser.add_argument
     option("sheet", metavar="SHEET", help="the number of a sheet in docs/course, or the path of its notebook")
     option("solution", metavar="SOLUTION", type=Path, help="the student's notebook")
     option("--seconds", type=whole(1), default=20, help="for each cell and each exercise (default 20)")
     option("--memory", type=whole(1), default=4, help="GiB that the notebook may address (default 4)")
     return parser
+
+
+if __name__ == "__main__":
+    run(main)

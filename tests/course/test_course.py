@@ -7,10 +7,10 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from grading.sheet import COURSE, NOT_GRADED, find_sheet, grade, read_cells, read_exercises
 from helpers.support import ROOT
 
 import gridworld
-from gridworld.grading.sheet import COURSE, NOT_GRADED, find_sheet, grade, read_cells, read_exercises
 
 SHEETS = {path.stem: path for path in sorted(COURSE.glob("*.ipynb"))}
 # By sheet: what is replaced in its solution, and the exercises that this costs.
