@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from gridworld.base.bounds import Bounds
 from gridworld.base.errors import InputError
-from gridworld.world.shown import unusual_numbers, usual_numbers
 
 IntArray = NDArray[np.integer[Any]]
 FloatArray = NDArray[np.float64]
@@ -183,6 +182,8 @@ class Mdp:
             return self.state_names[int(self.number[state])]
         if self.places is None or (self.places[state] < 0).any():
             if self.is_enumerated and self._usual:
+                from gridworld.world.shown import unusual_numbers
+
                 return f"observation with {unusual_numbers(self.own_observation, self._usual, state)}"
             return f"state {int(self.number[state])}"
         panel, row, col = self.places[state].tolist()
@@ -191,6 +192,8 @@ class Mdp:
 
     @cached_property
     def _usual(self) -> dict[str, NDArray[Any]]:
+        from gridworld.world.shown import usual_numbers  # here, with Gymnasium, which a browser does not have
+
         return {} if self.own_observation is None else usual_numbers(self.own_observation)
 
     def action_choices(self) -> str:
