@@ -21,8 +21,14 @@ PRINTED = {
     "score_your_own_table.py": "certified optimal",
     "family_of_worlds.py": "| all | 1 | 1 | 1 | 1 |",
     "check_a_numpy_agent.py": "train: passed all 11 probes",
+    "optimal_values.py": "| CliffWalking-v1 | 1 | -13.000000 | -13.000000 | 13.00 | 100.0 % |",
 }
-ARGUMENTS = {"family_of_worlds.py": ["dqn", "--pairs", "2", "--observations", "one_hot"]}
+ARGUMENTS = {
+    "family_of_worlds.py": ["dqn", "--pairs", "2", "--observations", "one_hot"],
+    "optimal_values.py": ["CliffWalking-v1"],
+}
+OPTIMA = module_of("examples/optimal_values")
+ENUMERATED = ("Blackjack-v1", "MiniGrid-Empty-5x5-v0")
 
 
 def test_all_examples_are_tried() -> None:
@@ -67,6 +73,18 @@ def test_an_example(name: str, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert PRINTED[name] in done.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ENUMERATED)) for name in OPTIMA.WORLDS]
+)
+def test_the_page_of_optimal_values_has_what_its_command_prints(name: str) -> None:
+    if name.startswith("MiniGrid"):
+        pytest.importorskip("minigrid")
+    rows, policy = OPTIMA.optimum(name)
+    page = (ROOT / "docs" / "reference" / "optimal-values.md").read_text("utf-8")
+    assert [line for line in page.splitlines() if line.startswith(f"| {name} |")] == rows
+    assert f"## {name}\n\n```text\n{policy}\n```\n" in page
 
 
 @pytest.mark.filterwarnings("ignore")
