@@ -44,6 +44,13 @@ def test_a_page_runs(page: Path, reader: Reader, monkeypatch: pytest.MonkeyPatch
     reader.read(page)
 
 
+def test_commands_within_sentences_are_read() -> None:
+    for page in PAGES:
+        text = " ".join(page.read_text("utf-8").split())
+        for command in re.findall(r"`(python scripts/(?!NAME)[^`]+)`", text):
+            check(command)
+
+
 # Turns that a reader stumbles over, and the usual ones.
 TURNS = {
     r"told|tells": "say, print, show",
