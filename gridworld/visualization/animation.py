@@ -1,7 +1,7 @@
 """Animations as palette images that are drawn one at a time: however many there are, one is in memory.
 
-The pictures of an animation share one palette. Those drawn here have few colours, so that every pixel stays
-exact; what an environment of another library draws may have more than a palette, and is quantised.
+The pictures of an animation share one palette. Frames of episodes drawn here have few colours, so that every
+pixel stays exact; maps, whose shapes have smooth edges, and what another library draws may have more.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from gridworld.envs.rollout import Episode
 from gridworld.world.mdp import IntArray, Mdp
 
 _MOST_COLOURS = 256
+_MOST_NUMBERED = 65_535  # colours, of which the most frequent are kept
 _LONGEST_SIDE = 1000  # pixels, where no cell size is asked for
 _MOST_ENCODED = 8_000_000  # bytes that are kept of a world's files
 _SAMPLED = 3_000_000  # bytes of all frames that a common palette is made from
@@ -104,12 +105,22 @@ def _cards(mdp: Mdp, episode: Episode) -> Iterator[tuple[str, ...]]:
 
 
 def animation_of_frames(frames: Iterable[Frame | Packed], likely: Iterable[Sequence[int]] = ()) -> Animation:
-    """Show RGB or packed frames one after the other; `likely` colours of most pixels save time."""
-    numbered = _number(frames, likely)
+    """Show RGB or packed frames one after the other; `likely` colours of most pixels save time.
+
+    Of more than 256 colours the most frequent stay exact, and each other one becomes the nearest of them.
+    """
+    numbered = _number(frames, likely, _MOST_NUMBERED)
     if numbered is None:
-        raise InputError(f"a film can have at most {_MOST_COLOURS} colours, one palette")
+        raise InputError(f"a film can have at most {_MOST_NUMBERED:,} colours")
     pictures, palette = numbered
-    return Animation(range(len(pictures)), lambda index: _image(pictures[index], palette))
+    if len(palette) > _MOST_COLOURS:
+        counts = sum(np.bincount(each.ravel(), minlength=len(palette)) for each in pictures)
+        kept = np.argsort(-counts, kind="stable")[:_MOST_COLOURS]
+        colours = palette.astype(np.float32)  # |a - b|² up to what all b have in common
+        distance = (colours[kept] ** 2).sum(axis=1) - 2 * colours @ colours[kept].T
+        nearest, palette = distance.argmin(axis=1), palette[kept]
+        pictures = [nearest.astype(np.uint8)[each] for each in pictures]
+    return Animation(range(len(pictures)), lambda index: _image(pictures[index].astype(np.uint8), palette))
 
 
 def animation_of_rendered(
@@ -143,9 +154,9 @@ def _image(picture: Picture, palette: Palette) -> Image.Image:
 
 
 def _number(
-    pictures: Iterable[NDArray[Any]], first: Iterable[Sequence[int]] = ()
-) -> tuple[list[Picture], Palette] | None:
-    """The pictures as numbers into one palette, which begins with these colours; None: too many colours."""
+    pictures: Iterable[NDArray[Any]], first: Iterable[Sequence[int]] = (), most: int = _MOST_COLOURS
+) -> tuple[list[NDArray[Any]], Palette] | None:
+    """The pictures as numbers into one palette, which begins with these colours; None: more than `most`."""
     numbers, numbered = _colour_numbers(), []
     palette = list(dict.fromkeys(red << 16 | green << 8 | blue for red, green, blue in first))
     try:
@@ -155,12 +166,13 @@ def _number(
             found = numbers[packed]
             if not found.all():
                 new = np.unique(packed[found == 0])
-                if len(palette) + len(new) > _MOST_COLOURS:
+                if len(palette) + len(new) > most:
                     return None
                 numbers[new] = range(1 + len(palette), 1 + len(palette) + len(new))
                 palette += new.tolist()
                 found = numbers[packed]
-            numbered.append(np.subtract(found, 1, dtype=np.uint8, casting="unsafe"))
+            kind = np.uint8 if most <= _MOST_COLOURS else np.uint16
+            numbered.append(np.subtract(found, 1, dtype=kind, casting="unsafe"))
     finally:
         numbers[palette] = 0
     return numbered, np.array(palette, dtype=">u4").view(np.uint8).reshape(-1, 4)[:, 1:]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.envs import rendering as drawing
-from gridworld.envs.rendering import AGENT, INK, UNKNOWN, Colour, Frame, Kind, Point, board_of
+from gridworld.envs.rendering import AGENT, GOAL, INK, UNKNOWN, Colour, Frame, Kind, Point, board_of
 from gridworld.visualization.sheet import (
     PAPER,
     UNREACHABLE,
@@ -22,14 +22,15 @@ from gridworld.visualization.sheet import (
     Scale,
     Sheet,
     Swatch,
+    disc,
 )
 from gridworld.world.grid import GridMdp
 from gridworld.world.layout import MOVES
-from gridworld.world.mdp import FloatArray, IntArray, Mdp
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
-_LONGEST_SIDE = 640  # pixels, of the grid with its border
+_LONGEST_SIDE = 640  # pixels, of the grid with its border; twice as many where it is more than colours
 _LONGEST_MOSAIC = 1000  # pixels, of several panels
-_LARGEST_CELL = 80  # pixels
+_LARGEST_CELL = 80  # pixels, or twice as many
 _NO_GRID = 8  # pixels; on smaller cells grid lines would hide the colours
 _SMALLEST_SEPARATED_CELL = 24  # pixels
 _SEPARATOR: Colour = (205, 205, 205)
@@ -42,24 +43,28 @@ _COLOURS = {  # of the cells that have no numbers
     Kind.FLOOR: PAPER,
     Kind.WALL: drawing.WALL,
     Kind.CLIFF: drawing.CLIFF,
-    Kind.GOAL: drawing.GOAL,
+    Kind.GOAL: GOAL,
     Kind.TRAP: drawing.TRAP,
 }
 _WITHOUT_GRID = np.array([_COLOURS[kind] for kind in Kind], dtype=np.uint8)
 _WITH_GRID = _WITHOUT_GRID.copy()
 _WITH_GRID[[Kind.GOAL, Kind.TRAP]] = PAPER  # below what is drawn there
+_TRIANGLE = ((0.5, 0.2), (0.8, 0.8), (0.2, 0.8))  # the goal's, as frames have it
 
 
 class Canvas(Sheet):
     """A picture of a world that has places. Raises `InputError` where it would be too large to draw."""
 
     def __init__(self, mdp: Mdp, cell_size: int | None = None, legend_rows: int = 1) -> None:
-        self.mdp, self.board = mdp, board_of(mdp)
+        self.mdp, self.board, zoom = mdp, board_of(mdp), 1
         if cell_size is None:
-            longest = _LONGEST_SIDE if len(self.board.panels) <= 1 else _LONGEST_MOSAIC
+            is_mosaic = len(self.board.panels) > 1
+            longest = _LONGEST_MOSAIC if is_mosaic else _LONGEST_SIDE
             cell_size = drawing.fitting_cell_size(mdp, longest, _LARGEST_CELL)
+            zoom = 2 if cell_size >= _NO_GRID and not is_mosaic else 1
+            cell_size *= zoom
         width, height = drawing.frame_size(mdp, cell_size)
-        super().__init__(width, height, cell_size, legend_rows, cell_size if mdp.panel_names else 0)
+        super().__init__(width, height, cell_size, legend_rows, cell_size if mdp.panel_names else 0, zoom)
 
     def point(self, state: int, right: float, down: float) -> Point:
         """The point that many cells right of and below the state's corner, in pixels of `world`."""
@@ -74,7 +79,7 @@ class Canvas(Sheet):
     @property
     def path_swatch(self) -> Swatch:
         """What the legend says of `draw_paths`."""
-        return Swatch("greedy path from the start" if self.cell >= 24 else "greedy path", AGENT, PAPER)
+        return Swatch("greedy path from the start" if self.cell >= 24 else "greedy path", AGENT, AGENT)
 
     @property
     def has_grid(self) -> bool:
@@ -98,11 +103,19 @@ class Canvas(Sheet):
         image = drawing.import_pygame().image.frombuffer(np.ascontiguousarray(picture), size, "RGBX")
         self.world.blit(image, (cell, cell))
 
-    def draw_world(self) -> None:
-        """Grid lines, traps and goals over what was painted; on small cells a line around each panel."""
+    def draw_world(self, paths: Sequence[list[int]] = (), ways: Sequence[list[int]] = ()) -> None:
+        """Grid lines, paths, traps and goals over what was painted; on small cells a line around each panel.
+
+        A path is a line through neighbours, also along the way (S, 2) of a state's action, from a disc.
+        """
         if self.has_grid:
             drawing.draw_grid(self.world, self.board, self.cell)
-            drawing.draw_terminals(self.world, self.board, self.cell)
+        for path in paths:
+            self._draw_path([state for state in path if self.board.place[state][0] >= 0], ways)
+        if self.has_grid:
+            for kind, ink, corners in ((Kind.TRAP, drawing.TRAP, disc(1 / 3)), (Kind.GOAL, GOAL, _TRIANGLE)):
+                for row, col in self.board.cells[kind]:
+                    self.draw_shape(((col + 1.5) * self.cell, (row + 1.5) * self.cell), corners, ink)
             return
         for panel in self.board.panels:
             left, top = (panel.left + 1) * self.cell - 1, (panel.top + 1) * self.cell - 1
@@ -148,7 +161,7 @@ class Canvas(Sheet):
     def mark(self, states: IntArray, colour: Colour) -> None:
         """A frame inside each of these cells, edged in white; a dot where the cells are small."""
         rect, cell = drawing.import_pygame().draw.rect, self.cell
-        thick, dot = max(1, cell // 14), max(1, cell // 2)
+        thick, dot = max(1, cell // 20), max(1, cell // 2)
         for state in states.tolist():
             left, top = (round(side) for side in self.point(state, 0, 0))
             if not self.has_grid:
@@ -159,43 +172,39 @@ class Canvas(Sheet):
                 rect(self.world, PAPER, (left + 1 + thick, top + 1 + thick, inner, inner), 1)
             rect(self.world, colour, (left + 1, top + 1, cell - 1, cell - 1), thick)
 
-    def draw_paths(self, paths: list[list[int]], ways: list[list[int]], middle: float) -> None:
-        """A ring around each start, and lines through neighbours, `middle` of a cell below its edge."""
-        place = self.board.place
-        for path in paths:
-            placed, lines = [state for state in path if place[state][0] >= 0], []
-            for state, following in pairwise(placed):
-                down, right = place[following][0] - place[state][0], place[following][1] - place[state][1]
-                if abs(down) + abs(right) <= 1 or [down, right] == ways[state]:  # along a diagonal, perhaps
-                    (x, y), (to_x, to_y) = self.point(state, 0.5, middle), self.point(following, 0.5, middle)
-                    if self.mdp.terminal[following] and self.has_grid:  # what is drawn there stays whole
-                        to_x, to_y = (x + to_x) / 2, (y + to_y) / 2
-                    lines.append(((x, y), (to_x, to_y)))
-            self._draw_lines(lines)
-            if placed:
-                self._draw_ring(self.point(placed[0], 0.5, middle))
-
-    def _draw_lines(self, segments: Sequence[tuple[Point, Point]]) -> None:
-        """Lines edged in white; thin on small cells."""
-        thick = max(1, self.cell // 10)
-        edge = 2 if self.cell >= 5 * _NO_GRID else 1 if self.cell >= 2 * _NO_GRID else 0
-        for half, ink in ((thick / 2 + edge, PAPER), (thick / 2, AGENT)) if edge else ((0.5, AGENT),):
+    def _draw_path(self, path: list[int], ways: Sequence[list[int]]) -> None:
+        """A thin line, edged in white where cells are large."""
+        place, segments = self.board.place, []
+        for state, following in pairwise(path):
+            down, right = place[following][0] - place[state][0], place[following][1] - place[state][1]
+            if abs(down) + abs(right) <= 1 or [down, right] == ways[state]:  # along a diagonal, perhaps
+                segments.append((self.point(state, 0.5, 0.5), self.point(following, 0.5, 0.5)))
+        half, edge = max(0.5, self.cell / 40), round(self.cell / 50 + 0.2) if self.cell >= 2 * _NO_GRID else 0
+        for thick, ink in ((half + edge, PAPER), (half, AGENT)) if edge else ((half, AGENT),):
             for (x, y), (to_x, to_y) in segments:
                 if x != to_x and y != to_y:
                     draw = drawing.import_pygame().draw
-                    draw.line(self.world, ink, (x, y), (to_x, to_y), round(2.8 * half))
+                    draw.line(self.world, ink, (x, y), (to_x, to_y), round(2.8 * thick))
                     continue
-                left, top = round(min(x, to_x) - half), round(min(y, to_y) - half)
-                size = round(abs(x - to_x) + 2 * half), round(abs(y - to_y) + 2 * half)
+                left, top = round(min(x, to_x) - thick), round(min(y, to_y) - thick)
+                size = round(abs(x - to_x) + 2 * thick), round(abs(y - to_y) + 2 * thick)
                 self.world.fill(ink, (left, top, *size))
+        if path:
+            self.draw_shape(self.point(path[0], 0.5, 0.5), disc(0.24), AGENT, PAPER)
 
-    def _draw_ring(self, middle: Point) -> None:
-        """A ring edged in white; a dot on small cells."""
-        circle = drawing.import_pygame().draw.circle
-        radius, thick = max(2, round(0.36 * self.cell)), max(1, self.cell // 14)
-        if self.cell >= 2 * _NO_GRID:
-            circle(self.world, PAPER, middle, radius + 1, thick + 3)
-        circle(self.world, AGENT, middle, radius, thick if self.has_grid else 0)
+    def write_values(self, values: FloatArray, chosen: BoolArray, colours: ColourArray, high: float) -> None:
+        """Write numbers (S,) off the paths, in the corners of the chosen cells (S,) of these colours (S, 3).
+
+        Where corners are too small for them, they are in the middle, on plates.
+        """
+        corner = self.number_size(values[chosen], high, 0.36)
+        size = corner or self.number_size(values[chosen], high, 0.8)
+        right = 0.73 if corner else 0.5
+        self.write_numbers(
+            *(values[:, None], chosen[:, None], colours[:, None], high, size),
+            lambda state, _: self.point(state, right, 0.81),
+            on_plates=not corner,
+        )
 
 
 def directions(mdp: Mdp) -> IntArray:

@@ -6,13 +6,16 @@ grey in pictures of the policy: its values are guesses, and no part of the scale
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs import rendering as drawing
+from gridworld.base.errors import InputError
 from gridworld.envs.rendering import (
     AGENT,
     INK,
@@ -20,7 +23,6 @@ from gridworld.envs.rendering import (
     UNKNOWN,
     Colour,
     Frame,
-    Point,
     board_of,
     fitting_cell_size,
 )
@@ -36,10 +38,12 @@ from gridworld.visualization.sheet import (
     UNKNOWN_INK,
     UNREACHABLE,
     VIRIDIS,
+    Corners,
     Scale,
     Sheet,
     Swatch,
     counting,
+    disc,
     is_dark,
     linear,
 )
@@ -64,8 +68,9 @@ def policy(subject: Subject) -> Draw:
     optimal, known = subject.evaluator.solution.optimal, explored(mdp, visits)
     caption = _policy_caption(subject, subject.steps)
     if board_of(mdp).panels:
+        ends = _possible(subject, snapshot.values)
         return lambda cell_size: draw_policy_map(
-            mdp, snapshot.values, snapshot.greedy, optimal, caption, cell_size, known=known
+            mdp, snapshot.values, snapshot.greedy, optimal, caption, cell_size, known=known, ends=ends
         ).frame()
     states = table_states(mdp, visits)
     if snapshot.q is None:
@@ -86,7 +91,8 @@ def learning(subject: Subject) -> Draw:
     board, known = board_of(mdp), explored(mdp, subject.visits)
     states = np.flatnonzero(board.floor) if board.panels else table_states(mdp, subject.visits)
     visited = states[known[states]]
-    scale = linear(VIRIDIS, np.stack([moment.values[visited] for moment in moments]))
+    values = np.stack([moment.values[visited] for moment in moments])
+    scale = linear(VIRIDIS, np.clip(values, *_possible(subject, values)))
     side = _LEARNING_SIDE if len(board.panels) <= 1 else _LEARNING_MOSAIC_SIDE
     cell_size = subject.config.recording.cell_size or fitting_cell_size(mdp, side)
 
@@ -144,7 +150,21 @@ def explored(mdp: Mdp, visits: NDArray[np.int64] | None) -> BoolArray:
 
 
 def _policy_caption(subject: Subject, steps: int) -> str:
-    return f"greedy policy after {steps:,} steps, the agent's gamma {agents_gamma(subject):g}"
+    own, scores = agents_gamma(subject), subject.evaluator.solution.gamma
+    numbers = f"the agent's own estimates, discount {own:g}" + (f"; scores use {scores:g}" * (own != scores))
+    return f"greedy policy after {steps:,} steps\n{numbers}"
+
+
+def _possible(subject: Subject, values: NDArray[Any]) -> tuple[float, float]:
+    """The least and the most that policies can be worth in states that these values may be estimates of."""
+    mdp, gamma = subject.evaluator.mdp, agents_gamma(subject)
+    playing = mdp.reachable & ~mdp.terminal
+    ends = [-math.inf, math.inf]
+    with contextlib.suppress(InputError):  # rewards may add up without an end
+        ends[1] = float(solved(mdp, gamma).v[playing].max())
+        if values.min() < min(0.0, mdp.reward.min()):  # worth the search for the worst policy
+            ends[0] = -float(solved(replace(mdp, reward=-mdp.reward), gamma).v[playing].max())
+    return ends[0], ends[1]
 
 
 def draw_policy_map(
@@ -156,46 +176,39 @@ def draw_policy_map(
     cell_size: int | None = None,
     scale: Scale | None = None,
     known: BoolArray | None = None,
+    ends: tuple[float, float] = (-math.inf, math.inf),
 ) -> Canvas:
     """Draw values (S,) as colours, greedy actions (S,) as arrows, and the greedy path from the start.
 
     A cell whose greedy action is not one of the `optimal` (S, A) has a red frame, and one that is not `known`
-    (S,) is grey. With a `scale`, for pictures that are to be compared, no numbers are written.
+    (S,) is grey. With a `scale`, for pictures that are to be compared, no numbers are written; without one,
+    colours are between those `ends` at most.
     """
     canvas = Canvas(mdp, cell_size, legend_rows=2)
     playable = canvas.board.floor
     known = playable if known is None else known & playable
-    own = linear(VIRIDIS, values[known])
-    ends = scale or own
-    colours = ends.colours(values)
+    shown = scale or linear(VIRIDIS, np.clip(values[known], *ends))
+    colours = shown.colours(values)
     colours[~known] = UNKNOWN
     canvas.paint(colours[:, None])
-    canvas.draw_world()
-    with_numbers = scale is None and len(canvas.board.panels) <= 1  # of several panels the cells are small
-    size = canvas.number_size(values[known], own.high, 0.8) if with_numbers else 0
-    inks = np.where(known[:, None], np.where(is_dark(colours)[:, None], PAPER, INK), UNKNOWN_INK).tolist()
-    middle = 0.4 if size else 0.5  # of the arrows, above the numbers
     paths = greedy_paths(mdp, greedy)
     ways = directions(mdp)[np.arange(mdp.num_states), greedy].tolist()
-    canvas.draw_paths(paths, ways, middle)
-    length = 0.85 * canvas.cell if size else canvas.cell
-    letter = min(round(0.32 * length), 20)
-    draw = drawing.import_pygame().draw
+    canvas.draw_world(paths, ways)
+    with_numbers = scale is None and len(canvas.board.panels) <= 1  # of several panels the cells are small
+    dark, length = is_dark(colours).tolist(), 0.7 if with_numbers else 0.85
     for state in np.flatnonzero(playable).tolist() if canvas.cell >= _SMALLEST_ARROW_CELL else []:
-        point = canvas.point(state, 0.5, middle)
+        point = canvas.point(state, 0.5, 0.5)
+        ink, edge = (PAPER, INK) if dark[state] else (INK, PAPER)
+        if not known[state]:
+            ink, edge = UNKNOWN_INK, UNKNOWN
         if any(ways[state]):
-            draw.polygon(canvas.world, inks[state], _arrow(*point, *ways[state], length))
+            canvas.draw_shape(point, _arrow(*ways[state], length), ink, edge)
             continue
-        draw.circle(canvas.world, inks[state], point, round(0.2 * length))
-        if letter >= SMALLEST_TEXT:
-            name = mdp.action_names[greedy[state]]
-            # An animation has one palette, which smooth letters in all colours of the scale would overfill.
-            canvas.write(name[:1].upper(), point, letter, colours[state].tolist(), smooth=scale is None)
-    canvas.write_numbers(
-        *(values[:, None], known[:, None], colours[:, None], own.high, size),
-        lambda state, _: canvas.point(state, 0.5, 0.83),
-        plates=set().union(*paths),
-    )
+        canvas.draw_shape(point, disc(0.2 * length), ink, edge)
+        if (letter := min(round(0.32 * length * canvas.cell), 40)) >= SMALLEST_TEXT:
+            canvas.write(mdp.action_names[greedy[state]][:1].upper(), point, letter, edge)
+    if with_numbers:
+        canvas.write_values(values, known, colours, shown.high)
     wrong = playable & ~optimal[np.arange(mdp.num_states), greedy]
     canvas.mark(np.flatnonzero(wrong & ~known), _UNKNOWN_DISAGREES)
     canvas.mark(np.flatnonzero(wrong & known), DISAGREES)
@@ -203,30 +216,29 @@ def draw_policy_map(
     swatches = [canvas.path_swatch] if paths else []
     swatches.append(Swatch("not optimal in this cell", frame=DISAGREES, thick=2))
     swatches += [] if known[playable].all() and not canvas.hidden else [NEVER_VISITED]
-    canvas.legend(ends, "value", swatches)
+    canvas.legend(shown, "value", swatches)
     return canvas
 
 
-@functools.lru_cache(maxsize=1 << 13)  # the same arrows are drawn in every picture of an animation
-def _arrow(x: float, y: float, down: int, right: int, size: float) -> list[Point]:
-    length = math.hypot(down, right)
-    to_down, to_right = down / length, right / length
-    return [
-        (x + size * (along * to_right - across * to_down), y + size * (along * to_down + across * to_right))
-        for along, across in _ARROW
-    ]
+@functools.cache
+def _arrow(down: int, right: int, length: float, shift: float = 0.0) -> Corners:
+    """The corners of an arrow in a cell, that far along its way from the middle."""
+    way = math.hypot(down, right)
+    to_down, to_right = down / way, right / way
+    corners = [(length * along + shift * way, length * across) for along, across in _ARROW]
+    return tuple(
+        (0.5 + along * to_right - across * to_down, 0.5 + along * to_down + across * to_right)
+        for along, across in corners
+    )
 
 
 def draw_optimal_actions(canvas: Canvas, optimal: BoolArray) -> None:
     """Draw an arrow for each optimal action (S, A), outwards from the middle; a dot for one that stays."""
-    ways, draw = directions(canvas.mdp), drawing.import_pygame().draw
+    ways = directions(canvas.mdp)
     for state, action in np.argwhere(optimal & canvas.board.floor[:, None]).tolist():
         down, right = ways[state, action].tolist()
-        point, length = canvas.point(state, 0.5 + 0.25 * right, 0.5 + 0.25 * down), 0.6 * canvas.cell
-        if down or right:
-            draw.polygon(canvas.world, INK, _arrow(*point, down, right, length))
-        else:
-            draw.circle(canvas.world, INK, point, length / 5)
+        corners = _arrow(down, right, 0.6, 0.25) if down or right else disc(0.12)
+        canvas.draw_shape(canvas.point(state, 0.5, 0.5), corners, INK)
 
 
 def _finish_policy_table(
@@ -293,17 +305,9 @@ def draw_regret(mdp: Mdp, cost: FloatArray, greedy: IntArray, caption: str, cell
     colours = scale.colours(cost)
     colours[cost == 0] = PAPER
     canvas.paint(colours[:, None])
-    canvas.draw_world()
-    ways = directions(mdp)[np.arange(mdp.num_states), greedy].tolist()
     paths = greedy_paths(mdp, greedy)
-    canvas.draw_paths(paths, ways, 0.4)
-    costly = (cost > 0) & canvas.board.floor
-    canvas.write_numbers(
-        *(cost[:, None], costly[:, None], colours[:, None], scale.high),
-        canvas.number_size(cost[costly], scale.high, 0.8),
-        lambda state, _: canvas.point(state, 0.5, 0.83),
-        plates=range(mdp.num_states),
-    )
+    canvas.draw_world(paths, directions(mdp)[np.arange(mdp.num_states), greedy].tolist())
+    canvas.write_values(cost, (cost > 0) & canvas.board.floor, colours, scale.high)
     canvas.caption(caption)
     swatches = [*([canvas.path_swatch] if paths else []), *([UNREACHABLE] if canvas.hidden else [])]
     canvas.legend(scale, "regret", swatches)

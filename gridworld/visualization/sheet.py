@@ -7,7 +7,9 @@ GIF.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Sequence
+import functools
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,6 +41,7 @@ DISAGREES: Colour = (213, 60, 50)  # the colour of a greedy action that is not o
 UNKNOWN_INK: Colour = (170, 170, 170)
 
 _STEPS = 128  # colours of a scale
+_FINER = 4  # times, to which shapes are drawn and made smaller again, for smooth edges
 _DECADES = 2.0  # a logarithmic scale from here on: below, a linear one still tells the cells apart
 
 
@@ -94,8 +97,33 @@ def counting(ramp: ColourArray, counts: NDArray[Any]) -> Scale:
 
 def is_dark(colours: ColourArray) -> BoolArray:
     """Whether white is easier to read than black on colours (..., 3), as (...,)."""
-    dark: BoolArray = colours @ np.array([0.299, 0.587, 0.114]) < 140
+    dark: BoolArray = colours @ np.array([0.299, 0.587, 0.114]) < 120
     return dark
+
+
+Corners = tuple[Point, ...]  # of a shape in a cell, from (0, 0) to (1, 1)
+
+
+@functools.cache
+def disc(radius: float) -> Corners:
+    """The corners of a polygon that looks like a disc in the middle of a cell."""
+    turns = [index * math.tau / 64 for index in range(64)]
+    return tuple((0.5 + radius * math.cos(turn), 0.5 + radius * math.sin(turn)) for turn in turns)
+
+
+@functools.lru_cache(maxsize=1 << 8)  # the same few are drawn in every cell, and in every picture of a film
+def _smooth(cell: int, corners: Corners, ink: Colour, edge: Colour | None) -> Any:
+    """A cell with that shape, transparent around it; edged in that colour."""
+    pygame, side = import_pygame(), _FINER * cell
+    large, points = pygame.Surface((side, side), pygame.SRCALPHA), [(x * side, y * side) for x, y in corners]
+    large.fill((*(edge or ink), 0))
+    if edge:
+        thick = max(_FINER, side // 50)
+        for start, end in zip(points, [*points[1:], points[0]], strict=True):
+            pygame.draw.line(large, edge, start, end, 2 * thick)
+            pygame.draw.circle(large, edge, start, thick)
+    pygame.draw.polygon(large, ink, points)
+    return pygame.transform.smoothscale(large, (cell, cell))
 
 
 @dataclass(frozen=True)
@@ -116,15 +144,18 @@ class Sheet:
     """A picture under construction; `world` is the surface of its middle, `width` x `height` pixels.
 
     The middle has a border of `cell` pixels, which is the unit of what is drawn in it; `names` is the height
-    of what is written into the upper border itself. The legend has 1 or 2 rows.
+    of what is written into the upper border itself. The legend has 1 or 2 rows. Words are `zoom` times as
+    large as they have to be.
     """
 
-    def __init__(self, width: int, height: int, cell: int, legend_rows: int = 1, names: int = 0) -> None:
-        self.cell = cell
-        self.text_size = min(max(cell // 4, 15), 20)  # of caption and legend, in pixels
+    def __init__(
+        self, width: int, height: int, cell: int, legend_rows: int = 1, names: int = 0, zoom: int = 1
+    ) -> None:
+        self.cell, self._zoom = cell, zoom
+        self.text_size = min(max(cell // 4, 15 * zoom), 20 * zoom)  # of caption and legend, in pixels
         self._legend_rows, self._names = legend_rows, names
         # The border of a cell is extended where words would not fit into it.
-        top = names + max(0, round(2.2 * self.text_size) - cell)
+        top = names + max(0, round(2.6 * self.text_size) - cell)
         bottom = max(0, round((1.1 + 1.5 * legend_rows) * self.text_size) - cell)
         side = max(0, 21 * self.text_size - width + 1) // 2
         self._surface = import_pygame().Surface((width + 2 * side, top + height + bottom), 0, 32)
@@ -133,7 +164,8 @@ class Sheet:
 
     def number_size(self, numbers: FloatArray, high: float, room: float) -> int:
         """The font size at which numbers fit into `room` cells; 0 where they could not be read."""
-        most, texts = min(round(0.3 * self.cell), 20), {short(each, high) for each in set(numbers.tolist())}
+        most = min(round(0.3 * self.cell), 20 * self._zoom)
+        texts = {short(each, high) for each in set(numbers.tolist())}
         if most < SMALLEST_TEXT or not texts:
             return 0
         return text_size(max(texts, key=lambda text: text_width(text, most)), most, room * self.cell) or 0
@@ -146,50 +178,51 @@ class Sheet:
         high: float,
         size: int,
         middle: Callable[[int, int], Point],
-        plates: Container[int] = (),
+        on_plates: bool = False,
     ) -> None:
-        """Write the chosen ones of numbers (S, P) on colours (S, P, 3), those of `plates` over a path."""
+        """Write the chosen ones of numbers (S, P) on colours (S, P, 3), which may hide what is below."""
         dark = is_dark(colours)
         for state, part in np.argwhere(chosen).tolist() if size else []:
             ink = PAPER if dark[state, part] else INK
-            plate = colours[state, part] if state in plates else None
+            plate = colours[state, part] if on_plates else None
             self.write(short(float(numbers[state, part]), high), middle(state, part), size, ink, plate)
 
+    def draw_shape(self, middle: Point, corners: Corners, ink: Colour, edge: Colour | None = None) -> None:
+        """Draw a shape in a cell around a point of `world`, with an edge of another colour."""
+        left, top = (round(place - self.cell / 2) for place in middle)
+        self.world.blit(_smooth(self.cell, corners, ink, edge), (left, top))
+
     def write(
-        self,
-        text: str,
-        middle: Point,
-        size: int,
-        ink: Colour,
-        plate: ColourArray | None = None,
-        smooth: bool = True,
+        self, text: str, middle: Point, size: int, ink: Colour, plate: ColourArray | None = None
     ) -> None:
-        """Write a text around a point of `world`, on a plate of that colour; not `smooth`: in one colour."""
-        image = font(size).render(text, smooth, ink)
+        """Write a text around a point of `world`, on a plate of that colour."""
+        image = font(size).render(text, True, ink)
         box = image.get_rect(center=middle)
         if plate is not None:
             self.world.fill(plate.tolist(), box)
         self.world.blit(image, box)
 
     def caption(self, text: str) -> None:
-        """Write one line above the grid, smaller where it is long."""
-        self._line(text, (self.world.get_offset()[1] + self.cell - self._names) // 2)
+        """Write one or two lines above the grid, smaller where they are long."""
+        self._write_lines(text, (self.world.get_offset()[1] + self.cell - self._names) // 2)
 
     def footer(self, text: str) -> None:
         """Write one line below the grid."""
-        self._line(text, (self._bottom() + self._surface.get_height()) // 2)
+        self._write_lines(text, (self._bottom() + self._surface.get_height()) // 2)
 
     def _bottom(self) -> int:
         """The lower end of the grid, without its border."""
         return int(self.world.get_offset()[1] + self.world.get_height() - self.cell)
 
-    def _line(self, text: str, middle: int) -> None:
-        if text:
-            width, size = self._surface.get_width(), self.text_size
-            centred = max(6, (width - text_width(text, size)) // 2)
-            left = min(self.world.get_offset()[0] + self.cell, centred)
-            size = text_size(text, size, width - left - 6) or SMALLEST_TEXT
-            write(self._surface, text, left, middle, size)
+    def _write_lines(self, text: str, middle: int) -> None:
+        width, size, lines = self._surface.get_width(), self.text_size, text.splitlines()
+        widest = max(lines, key=lambda line: text_width(line, size), default="")
+        centred = max(6, (width - text_width(widest, size)) // 2)
+        left = min(self.world.get_offset()[0] + self.cell, centred)
+        for number, line in enumerate(lines):
+            down = round((number - (len(lines) - 1) / 2) * 1.25 * size)
+            fitting = text_size(line, size, width - left - 6) or SMALLEST_TEXT
+            write(self._surface, line, left, middle + down, fitting)
 
     def legend(self, scale: Scale, name: str, swatches: Sequence[Swatch] = ()) -> None:
         """Draw the colour bar between its ends, and the swatches, in the second row if any."""
@@ -218,7 +251,7 @@ class Sheet:
         for swatch in swatches:
             box = (left, middles[-1] - size // 2, size, size)
             self._surface.fill(swatch.fill, box)
-            import_pygame().draw.rect(self._surface, swatch.frame, box, swatch.thick)
+            import_pygame().draw.rect(self._surface, swatch.frame, box, swatch.thick * self._zoom)
             left = write(self._surface, swatch.label, left + size + size // 4, middles[-1], size) + size
 
     def _swatches_width(self, swatches: Sequence[Swatch], size: int) -> int:

@@ -8,6 +8,8 @@ import pytest
 from helpers.support import SHORT, train_in
 from PIL import Image
 
+from gridworld.agents.tabular.td_control import TabularConfig
+from gridworld.config.train import TrainConfig
 from gridworld.envs.rendering import AGENT, CLIFF, GOAL, TRAP, UNKNOWN, WALL, Frame
 from gridworld.visualization.canvas import Canvas, greedy_paths
 from gridworld.visualization.maps import (
@@ -15,15 +17,16 @@ from gridworld.visualization.maps import (
     draw_policy_map,
     draw_visit_map,
     explored,
+    policy,
     value_error,
 )
-from gridworld.visualization.picture import PolicyHistory
+from gridworld.visualization.picture import PolicyHistory, Subject
 from gridworld.visualization.sheet import BLUES, DISAGREES, ORANGES, VIRIDIS, Scale, counting, linear, short
-from gridworld.world.evaluation import PolicySnapshot
+from gridworld.world.evaluation import Evaluator, PolicySnapshot
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 from gridworld.world.mdp import Mdp
-from gridworld.world.solver import value_iteration
+from gridworld.world.solver import solved, value_iteration
 
 CLASSIC = compile_mdp(load("classic"))
 WORLDS = ["classic", "four_rooms", "maze", "cliff", "cliff_walking", "aima_4x3"]
@@ -114,6 +117,54 @@ def test_policy_map_marks_start_and_path_and_greys_what_was_never_visited() -> N
             assert has(picture, AGENT) == known[state]
             seen = linear(VIRIDIS, best.v[known]).colours(values)[state]
             assert corner == (tuple(seen) if known[state] else UNKNOWN)
+
+
+def test_a_path_runs_below_arrows_into_the_goal_and_beside_numbers() -> None:
+    best = value_iteration(CLASSIC, 0.99)
+    greedy = np.argmax(best.optimal, axis=1)
+    (path,) = greedy_paths(CLASSIC, greedy)
+    cells = cell_pictures(CLASSIC, draw_policy_map(CLASSIC, best.v, greedy, best.optimal).frame())
+    for state, picture in cells.items():
+        side = len(picture)
+        assert has(picture, AGENT) == (state in path)
+        assert not has(picture[int(0.74 * side) :, int(0.56 * side) :], AGENT)  # where the number is
+        if state in path[:-1]:
+            assert tuple(picture[side // 2, side // 2]) in ((0, 0, 0), (255, 255, 255))
+    goal = cells[path[-1]]
+    assert has(goal[:, -len(goal) // 4 :], AGENT)  # up to the triangle
+    assert not has(goal[:, : len(goal) // 2], AGENT)
+
+
+def test_an_arrow_has_a_dark_and_a_light_part_on_every_colour() -> None:
+    everything, greedy = np.ones((30, 4), dtype=bool), np.zeros(30, dtype=int)
+    values = np.linspace(0, 1, 30)
+    frame = draw_policy_map(CLASSIC, values, greedy, everything, scale=Scale(VIRIDIS, 0, 1)).frame()
+    cells = cell_pictures(CLASSIC, frame)
+    for state in playing(CLASSIC):
+        lightness = cells[state][2:-2, 2:-2] @ np.array([0.299, 0.587, 0.114])
+        assert lightness.min() < 30
+        assert lightness.max() > 225
+
+
+def test_colours_end_at_what_is_possible_and_the_caption_says_whose_numbers_they_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    captions: list[str] = []
+    monkeypatch.setattr(Canvas, "caption", lambda _, text: captions.append(text))
+    evaluator, visits = Evaluator(CLASSIC, 0.99, 100), np.ones((30, 4), dtype=int)
+    values = solved(CLASSIC, 0.9).v.copy()
+    values[[0, 5, 17]] = -2.5, 1.11, 1.0  # the most and the least that a policy can be worth: 1 and -1
+    values[11] = -1.0
+    snapshot = PolicySnapshot(np.zeros(30, dtype=int), np.full((30, 4), 0.25), values)
+    config = TrainConfig(agent=TabularConfig(name="mine", gamma=0.9))
+    frame = policy(Subject(config, True, evaluator, snapshot, 1234, visits))(None)
+    assert isinstance(frame, np.ndarray)
+    cells = cell_pictures(CLASSIC, frame)
+    shown = {state: tuple(cells[state][30, 30]) for state in (0, 5, 11, 17)}
+    low, high = tuple(VIRIDIS[0]), tuple(VIRIDIS[-1])
+    assert shown == {0: low, 11: low, 5: high, 17: high}
+    whose = "the agent's own estimates, discount 0.9; scores use 0.99"
+    assert captions == [f"greedy policy after 1,234 steps\n{whose}"]
 
 
 def test_paths_end_where_they_would_repeat_and_unreachable_cells_are_unknown() -> None:

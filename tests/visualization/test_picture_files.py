@@ -62,9 +62,20 @@ def test_a_gif_holds_any_film_exactly() -> None:
     assert sum(duration for _, duration in shown) == (len(frames) + 4) * 50
     still = animation_of_states(CLASSIC, np.zeros(1500, dtype=int), cell_size=4)
     assert sum(duration for _, duration in frames_of(files.encode_gif(still, 1))) == 1504 * 1000
-    noise = chance.integers(256, size=(40, 40, 3), dtype=np.uint8)
-    with pytest.raises(InputError, match="at most 256 colours"):
+    noise = chance.integers(256, size=(300, 300, 3), dtype=np.uint8)
+    with pytest.raises(InputError, match="at most 65,535 colours"):
         animation_of_frames([noise])
+
+
+def test_of_too_many_colours_the_frequent_stay_and_others_become_the_nearest() -> None:
+    frames = [np.full((60, 40, 3), grey, dtype=np.uint8) for grey in range(0, 256, 2)]
+    for grey, frame in zip(range(0, 256, 2), frames, strict=True):
+        frame[0, :2] = (grey, grey, grey + 1), (grey, grey + 1, grey)
+    shown = animation_of_frames(frames)
+    for key, frame in zip(shown.keys, frames, strict=True):
+        picture = np.asarray(shown.draw(key).convert("RGB")).astype(int)
+        assert np.array_equal(picture[1:], frame[1:])
+        assert np.abs(picture - frame).max() <= 1
 
 
 def test_png_is_exact() -> None:
