@@ -1,4 +1,4 @@
-"""`grade.py` of the course on a sheet of two exercises: what notebooks may do, and that it ends in its time."""
+"""`grade.py` of the course, on a sheet of two exercises: what notebooks may do, and that it ends in time."""
 
 import json
 import subprocess
