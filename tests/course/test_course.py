@@ -1,13 +1,14 @@
 """The sheets of docs/course: the solution has all points, and wrong ones lose those of what is wrong."""
 
 import json
+import shutil
 import subprocess
 import sys
 from functools import cache
 from pathlib import Path
 
 import pytest
-from grading.sheet import COURSE, NOT_GRADED, find_sheet, grade, read_cells, read_exercises
+from grading.sheet import COURSE, NOT_GRADED, find_sheet, grade, read_cells, read_sheet
 from helpers.support import ROOT
 
 import gridworld
@@ -44,6 +45,7 @@ WRONG: dict[str, list[tuple[str, str, str]]] = {
         ("return train(NeverTerminated(env),", "return train(env,", "4.6"),
     ],
 }
+ONLY_HIDDEN: tuple[str, ...] = ()  # what is wrong in the hidden worlds only
 NOTHING = """
 import numbers
 import numpy as np
@@ -79,9 +81,9 @@ def _train(*words: str, **settings: object) -> object:
     return train(*words, **settings)  # type: ignore[arg-type]
 
 
-def points_lost(sheet: str, notebook: Path) -> dict[str, str]:
+def points_lost(sheet: str, notebook: Path, course: Path = COURSE) -> dict[str, str]:
     """By the number of each exercise that has not all points: the sentence that says why."""
-    results = list(grade(find_sheet(str(SHEETS[sheet])), notebook, 120, 4 * 2**30))
+    results = list(grade(read_sheet(course / f"{sheet}.ipynb"), notebook, 120, 4 * 2**30))
     marked = [each for each in results if not isinstance(each, str)]
     assert [each for each in results if isinstance(each, str)] == []
     assert all(points in (0, exercise.points) for exercise, points, _ in marked)
@@ -114,17 +116,29 @@ def test_a_sheet_says_what_it_pays_and_has_no_answers(sheet: str) -> None:
     assert not any(cell.get("outputs") for cell in content["cells"])
     text = "\n".join("".join(cell["source"]) for cell in content["cells"])
     assert "solutions/" not in text
-    for each in read_exercises(SHEETS[sheet]):
+    exercises = read_sheet(SHEETS[sheet]).exercises
+    for each in exercises:
         assert each.title.split()[0] in text
         assert f"{each.points} points" in text
     lost = points_lost(sheet, SHEETS[sheet])
-    assert len(lost) == len(read_exercises(SHEETS[sheet]))
+    assert len(lost) == len(exercises)
     assert any("is not done yet" in sentence for sentence in lost.values())
 
 
 @pytest.mark.parametrize("sheet", SHEETS)
 def test_the_solution_has_all_points(sheet: str) -> None:
     assert points_lost(sheet, COURSE / "solutions" / f"{sheet}.ipynb") == {}
+
+
+@pytest.mark.parametrize("sheet", [path.stem for path in (COURSE / "hidden").iterdir()])
+def test_students_check_themselves_without_the_hidden_part(sheet: str, tmp_path: Path) -> None:
+    shutil.copytree(COURSE / "marking", tmp_path / "marking")
+    solution, missing = COURSE / "solutions" / f"{sheet}.ipynb", tmp_path / "hidden" / f"{sheet}.json"
+    assert points_lost(sheet, solution, tmp_path) == {}
+    assert read_sheet(tmp_path / f"{sheet}.ipynb").missing == missing
+    assert read_sheet(SHEETS[sheet]).missing is None
+    for old, new, lost in [(old, new, lost) for old, new, lost in WRONG[sheet] if old not in ONLY_HIDDEN]:
+        assert list(points_lost(sheet, changed(sheet, old, new, tmp_path), tmp_path)) == lost.split()
 
 
 @pytest.mark.parametrize(("sheet", "old", "new", "lost"), [(s, *row) for s in SHEETS for row in WRONG[s]])
@@ -141,7 +155,7 @@ def test_what_is_no_number_earns_no_points(sheet: str, value: str, tmp_path: Pat
     content = json.loads((COURSE / "solutions" / f"{sheet}.ipynb").read_text("utf-8"))
     content["cells"].append({"cell_type": "code", "source": NOTHING.replace("VALUE", value)})
     (tmp_path / "mine.ipynb").write_text(json.dumps(content))
-    assert len(points_lost(sheet, tmp_path / "mine.ipynb")) == len(read_exercises(SHEETS[sheet]))
+    assert len(points_lost(sheet, tmp_path / "mine.ipynb")) == len(read_sheet(SHEETS[sheet]).exercises)
 
 
 def test_a_right_answer_may_look_different(tmp_path: Path) -> None:

@@ -3,6 +3,9 @@
 The marking of `lab1_values.ipynb` is `marking/lab1_values.py` next to it: a function for each exercise,
 decorated with `exercise`. It asks the student's functions through `Work`, compares in its own process, and
 returns a sentence for full points or raises `WrongAnswerError` for none.
+
+Students may have the marking, to check themselves. Its dictionary `PUBLIC`, if it has one, says on what. The
+values in `hidden/lab1_values.json` replace those where this file is there.
 """
 
 from __future__ import annotations
@@ -44,6 +47,25 @@ def exercise(title: str, points: int) -> Callable[[Callable[[Work], str]], Exerc
     return lambda mark: Exercise(title, points, mark)
 
 
+@dataclass(frozen=True)
+class Sheet:
+    """A lab sheet, ready to mark notebooks.
+
+    Attributes:
+        name: of its files, without suffix.
+        missing: the file of the hidden part of its marking, if it should have one and has none.
+    """
+
+    name: str
+    exercises: list[Exercise]
+    missing: Path | None
+
+    @property
+    def points(self) -> int:
+        """The points of a notebook in which everything is right."""
+        return sum(each.points for each in self.exercises)
+
+
 def find_sheet(name: str) -> Path:
     """The notebook of a sheet: a path, or the number of a shipped one."""
     if name.isdigit():
@@ -57,19 +79,28 @@ def find_sheet(name: str) -> Path:
     return Path(name)
 
 
-def read_exercises(sheet: Path) -> list[Exercise]:
-    """The exercises of a sheet, from the file of its marking."""
-    path = sheet.parent / "marking" / f"{sheet.stem}.py"
+def read_sheet(notebook: Path) -> Sheet:
+    """Read the marking of a sheet, see `find_sheet`, with its hidden part where that is there."""
+    path = notebook.parent / "marking" / f"{notebook.stem}.py"
     if not path.is_file():
-        raise InputError(f"{path}: missing; the marking of {sheet.name} must be in this file")
+        if not notebook.exists():
+            raise InputError(f"{notebook}: no such file")
+        raise InputError(f"{path}: missing; the marking of {notebook.name} must be in this file")
     try:
         names = runpy.run_path(str(path))
     except Exception as error:
         raise InputError(f"{path}: cannot be run ({in_short(error)})") from error
-    found = [each for each in names.values() if isinstance(each, Exercise)]
-    if not found:
+    exercises = [each for each in names.values() if isinstance(each, Exercise)]
+    if not exercises:
         raise InputError(f"{path}: has no exercise; a function decorated with `exercise` is one")
-    return found
+    public, hidden = names.get("PUBLIC"), notebook.parent / "hidden" / f"{notebook.stem}.json"
+    if public is None or not hidden.exists():
+        return Sheet(notebook.stem, exercises, None if public is None else hidden)
+    values = read_object(hidden)
+    if values.keys() != public.keys():
+        raise InputError(f"{hidden}: must have the keys of PUBLIC in {path}: {', '.join(public)}")
+    public.update(values)
+    return Sheet(notebook.stem, exercises, None)
 
 
 def read_cells(notebook: Path) -> dict[int, str]:
@@ -87,26 +118,28 @@ def read_cells(notebook: Path) -> dict[int, str]:
 Marked = tuple[Exercise, int, str]  # its points, and the sentence that says why
 
 
-def grade(sheet: Path, notebook: Path, seconds: float, memory: int) -> Iterator[str | Marked]:
+def grade(sheet: Sheet, notebook: Path, seconds: float, memory: int) -> Iterator[str | Marked]:
     """Mark a student's notebook.
 
     Args:
-        sheet: the sheet's notebook, see `find_sheet`.
-        notebook: the student's.
+        sheet: see `read_sheet`.
+        notebook: the student's; one that cannot be read has no points.
         seconds: for each cell, and for each exercise.
         memory: bytes that the student's process may address.
 
     Yields:
-        Notes on cells that failed, then the result of each exercise.
-
-    Raises:
-        InputError: a file that is missing or is not what it must be.
+        Notes on the notebook and on cells that failed, then the result of each exercise.
     """
-    exercises, cells = read_exercises(sheet), read_cells(notebook)
+    try:
+        cells = read_cells(notebook)
+    except InputError as error:
+        yield str(error)
+        yield from ((each, 0, "the notebook cannot be read") for each in sheet.exercises)
+        return
     with Work(cells, seconds, memory) as work:
         work.begin()
         yield from (f"code cell {number} {why}" for number, why in work.failed.items())
-        for each in exercises:
+        for each in sheet.exercises:
             yield (each, *_mark(each, work))
 
 

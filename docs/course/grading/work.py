@@ -71,7 +71,7 @@ class Work:
         self._until = time.monotonic() + self._seconds
 
     def run(self, source: str) -> None:
-        """Run further code of the marking's own in the notebook, which is no safer there."""
+        """Run further code of the marking's own in the notebook, which can change it there."""
         self._ask("the notebook", {"cell": 0, "source": source})
 
     def call(self, function: str, *arguments: Any) -> Any:
@@ -138,7 +138,7 @@ class Work:
         try:
             self._wait()
             self._socket.sendall(json.dumps({**request, "number": self._number}).encode() + b"\n")
-            while True:  # what else it may have sent is no reply
+            while True:  # what else it may have sent is not the reply
                 reply = as_object(self._line(), Path("the reply"))
                 if reply.get("number") == self._number:
                     return reply

@@ -87,6 +87,8 @@ def what_fails(work: Work) -> str:
     found, failed = work.value("FAILED"), given_agent()
     if not isinstance(found, list) or not found:
         raise WrongAnswerError("`FAILED` must be a list of names")
+    if not failed:
+        raise WrongAnswerError(f"the agent in {SHEET.name} was changed; work in a copy of this file")
     for name in found:
         if name not in failed:
             raise WrongAnswerError(f"the given agent does not fail {str(name)[:30]}")
