@@ -1,4 +1,4 @@
-"""Draw worlds and watch tables learn in the browser: `python scripts/playground.py cliff`; see `--help`."""
+"""Draw worlds and watch Q-learning in the browser: `python scripts/playground.py cliff`; see `--help`."""
 
 from gridworld.base.signals import listen
 

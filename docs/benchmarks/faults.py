@@ -1,4 +1,4 @@
-"""Other people's faults: which `check` finds, which `diagnose` names, and which a test on rewards would find.
+"""Faults from published catalogues: which `check` finds, `diagnose` names, and a test on rewards would find.
 
     python docs/benchmarks/faults.py --results runs/faults.jsonl --seeds 5 --jobs 2
 

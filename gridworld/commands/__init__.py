@@ -35,7 +35,7 @@ COMMANDS = {
     "check": "check an algorithm's implementation on worlds with known answers",
     "examine": "examine an environment: why nothing learns in it",
     "play": "play a world yourself, next to a trained agent if you like",
-    "playground": "draw worlds and watch tables learn, in the browser",
+    "playground": "draw worlds and watch Q-learning at work, in the browser",
     "benchmark": "measure the speed of this project and its peers",
 }
 _MANUAL = """\

@@ -200,8 +200,7 @@ def recipe_note(config: TrainConfig, mdp: Mdp) -> str | None:
     why = f"{mdp.name} is stochastic" if mdp.is_stochastic else size
     if recipe is None:
         fitting = recipe_of_class(agent, config, lambda: mdp)
-        left_out = f"the recipe {fitting} is meant for that, but is left out because of the given settings"
-        return None if fitting is None else f"{why}: {left_out}"
+        return None if fitting is None else f"{why}; for settings that suit it, add {GROUP}={fitting}"
     own, _, name = recipe.rpartition("/")
     other = [] if own == agent else ["agent"]
     is_shipped = (conf_folder() / "env" / f"{name}.yaml").is_file()

@@ -106,7 +106,7 @@ def _trade(name: str, summary: Summary) -> str:
     if name != "goal_probability" or summary["certified"]:
         return ""
     is_above = summary[name] > summary[f"optimal_{name}"] + _ROUNDING
-    return "  more often than the optimum, but with less value" if is_above else ""
+    return "  more often than the optimum, but worth less" if is_above else ""
 
 
 def verdict(summary: Summary) -> str:
@@ -141,7 +141,7 @@ def circles_text(count: int, names: Sequence[str], timeout_probability: float) -
     """Half a sentence on a policy that loops in `count` states, the first few with `names`; "" if none."""
     if not count:
         return ""
-    more = f" and {count - len(names)} more states" if count > len(names) else ""
-    return (
-        f"; it loops until the step limit (probability {timeout_probability:.3g}) in {'; '.join(names)}{more}"
-    )
+    *others, last = [*names, f"{count - len(names)} more states"] if count > len(names) else names
+    where = f"moves between {'; '.join(others)} and {last}" if others else f"stays in {last}"
+    chance = "" if timeout_probability > 0.9995 else f" (probability {timeout_probability:.3g})"
+    return f"; it {where} until the step limit{chance}"

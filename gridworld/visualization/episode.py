@@ -63,7 +63,7 @@ def film(
         try:
             frames = rendered_frames(env, mdp, [each.states.tolist() for each in episodes])
         except InputError as error:
-            _log.warning("the episode is drawn without its environment: %s", error)
+            _log.warning("the episode is drawn from the tables, not by its environment: %s", error)
         else:
             return lambda cell_size: animation_of_rendered(
                 frames, range(len(frames)), None if cell_size is None else max(frame_size(mdp, cell_size))

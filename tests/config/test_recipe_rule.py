@@ -158,10 +158,7 @@ def test_the_line_before_training() -> None:
         "tuned=none keeps the agent's own settings"
     ]
     [line] = lines(configure("agent=dqn", "env.slip=0.1", "total_timesteps=1000", "agent.gamma=0.99"))
-    assert line == (
-        "classic is stochastic: the recipe dqn/stochastic is meant for that, but is left out because of the "
-        "given settings"
-    )
+    assert line == "classic is stochastic; for settings that suit it, add tuned=dqn/stochastic"
     for words, reason in (
         (["agent=dqn", "env=maze", "tuned=dqn/cliff"], ", tuned for another world:"),
         (["agent=sarsa", "env=maze", "tuned=expected_sarsa/cliff"], ", tuned for another agent and world:"),

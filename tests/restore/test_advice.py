@@ -63,6 +63,11 @@ def test_it_is_printed_and_a_certified_run_has_none(tmp_path: Path) -> None:
 
 def test_five_states_are_named_at_most() -> None:
     names = [f"row 1, column {n}" for n in range(1, 6)]
-    assert circles_text(5, names, 1).endswith("(probability 1) in " + "; ".join(names))
-    assert circles_text(158, names, 0.25).endswith("row 1, column 5 and 153 more states")
+    assert circles_text(5, names, 1) == (
+        f"; it moves between {'; '.join(names[:4])} and {names[4]} until the step limit"
+    )
+    assert circles_text(158, names, 0.25).endswith(
+        "row 1, column 5 and 153 more states until the step limit (probability 0.25)"
+    )
+    assert circles_text(1, names[:1], 1) == "; it stays in row 1, column 1 until the step limit"
     assert circles_text(0, [], 0) == ""
