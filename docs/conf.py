@@ -32,11 +32,25 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 
 
+MOVED = {  # by the address that a page had
+    "tutorials/cluster": "../how-to/cluster.html",
+    "how-to/ten-thousand-runs": "cluster.html#ten-thousand-runs",
+    "tutorials/tuning": "../how-to/tuning.html",
+}
+
+
 def setup(app):
     """Have options and the notebook filled in, docstrings' headings set in bold, the playground written."""
+    app.connect("build-finished", lambda app, _: redirect(Path(app.outdir)))
     app.connect("source-read", lambda app, name, source: fill(name, source))
     app.connect("build-finished", lambda app, _: Path(app.outdir, "playground.html").write_text(maps_page()))
     app.connect("autodoc-process-docstring", lambda app, what, name, thing, options, lines: tidy(lines))
+
+
+def redirect(folder):
+    """A page at each address that a page had leads to where it is now."""
+    for name, place in MOVED.items():
+        Path(folder, f"{name}.html").write_text(f'<meta http-equiv="refresh" content="0; url={place}">\n')
 
 
 def fill(name, source):

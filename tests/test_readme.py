@@ -42,11 +42,11 @@ def test_the_main_job_prints_what_the_readme_shows(tmp_path: Path) -> None:
 
 
 def test_an_optional_part_is_installed_on_the_page_that_needs_it() -> None:
-    """In an earlier line, unless another page is there to say so."""
+    """In an earlier line."""
     words = {"tune": "scripts/tune.py", "slurm": "launcher=slurm", "ray": "launcher=ray"}
     for page in PAGES:
         lines = [line for block in blocks(page, "bash", "text") for line in block.lines]
-        for extra, word in words.items() if page.stem != "ten-thousand-runs" else ():
+        for extra, word in words.items():
             needing = [
                 place for place, line in enumerate(lines) if line.startswith("python") and word in line
             ]
