@@ -34,6 +34,7 @@ html_css_files = ["site.css"]
 
 MOVED = {  # by the address that a page had
     "tutorials/cluster": "../how-to/cluster.html",
+    "how-to/environment": "worlds.html#maps-and-the-environment-without-the-rest",
     "how-to/ten-thousand-runs": "cluster.html#ten-thousand-runs",
     "tutorials/tuning": "../how-to/tuning.html",
 }
