@@ -260,7 +260,7 @@ def test_a_yaml_of_ones_own_may_choose_a_launcher_of_ours(
     words = f"train.py -m agent=q_learning seed=0,1 total_timesteps=0 --config-dir {tmp_path / 'conf'}"
     for target, more, told in (
         ("gridworld.sweeps.launchers.forks", "n_jobs: 0", "hydra.launcher.n_jobs=0: must be the number"),
-        ("gridworld.sweeps.launchers.joblib", "foo: 1", "foo: no such key"),
+        ("gridworld.sweeps.launchers.joblib", "foo: 1", "foo: no such setting"),
         ("hydra._internal.core_plugins.basic_launcher.BasicLauncher", "", "total_timesteps=0: must be"),
     ):
         monkeypatch.delenv(FULL_ERROR, raising=False)
