@@ -4,6 +4,9 @@ import re
 import sys
 from pathlib import Path
 
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
+
 sys.path.insert(0, str(Path(__file__).parent))
 
 import notebook
@@ -18,7 +21,8 @@ copyright = author
 version = release = gridworld.__version__
 
 extensions = ["myst_parser", "sphinx_copybutton", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["_build", "examples"]
+source_suffix = {".md": "markdown", ".ipynb": "markdown"}  # `fill` makes Markdown of notebooks
+exclude_patterns = ["_build", "examples", "course/solutions"]
 myst_enable_extensions = ["deflist"]
 myst_heading_anchors = 3
 default_role = "code"  # docstrings have names between single backquotes, as in Markdown
@@ -27,9 +31,11 @@ autodoc_typehints_description_target = "documented_params"
 autodoc_member_order = "bysource"
 napoleon_use_ivar = True
 html_theme = "furo"
+html_math_renderer = "mathml"
 html_title = "gridworld"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+MATH = '---\nmyst: {enable_extensions: ["dollarmath"]}\n---\n'
 
 
 MOVED = {  # by the address that a page had
@@ -41,9 +47,10 @@ MOVED = {  # by the address that a page had
 
 
 def setup(app):
-    """Have options and the notebook filled in, docstrings' headings set in bold, the playground written."""
+    """Have pages filled in, docstrings' headings set in bold, formulas drawn, the playground written."""
+    app.connect("source-read", lambda app, name, source: fill(app.env.doc2path(name), source))
     app.connect("build-finished", lambda app, _: redirect(Path(app.outdir)))
-    app.connect("source-read", lambda app, name, source: fill(name, source))
+    app.add_html_math_renderer("mathml", (formula, None), (formula, None))
     app.connect("build-finished", lambda app, _: Path(app.outdir, "playground.html").write_text(maps_page()))
     app.connect("autodoc-process-docstring", lambda app, what, name, thing, options, lines: tidy(lines))
 
@@ -54,12 +61,22 @@ def redirect(folder):
         Path(folder, f"{name}.html").write_text(f'<meta http-equiv="refresh" content="0; url={place}">\n')
 
 
-def fill(name, source):
-    """Fill in the page of options and the notebook."""
-    if name == "reference/options":
+def fill(path, source):
+    """Fill in the pages of options and of the notebook, and make a page of a lab sheet."""
+    if path.match("reference/options.md"):
         source[0] = option_tables.fill(source[0])
-    if name == "tutorials/quickstart":
-        source[0] = source[0].replace("<!-- notebook -->", notebook.page())
+    if path.match("tutorials/quickstart.md"):
+        shown = notebook.page(notebook.NOTEBOOK.read_text("utf-8"))
+        source[0] = source[0].replace("<!-- notebook -->", shown.split("\n", 1)[1])  # without its title
+    if path.suffix == ".ipynb":
+        title, rest = notebook.page(source[0]).split("\n", 1)
+        source[0] = f"{MATH}{title}\n\n{{download}}`The notebook <{path.name}>`, to work in.\n{rest}"
+
+
+def formula(translator, node):
+    """Draw a formula in MathML, for which a page loads nothing."""
+    translator.body.append(str(tex2mathml(node.astext(), as_block=isinstance(node, nodes.math_block))))
+    raise nodes.SkipNode
 
 
 def tidy(lines):

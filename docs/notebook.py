@@ -35,15 +35,15 @@ def to_store(notebook: Any) -> Any:
     return notebook
 
 
-def page() -> str:
-    """The notebook in Markdown for the site, without its title."""
-    cells = json.loads(NOTEBOOK.read_text("utf-8"))["cells"]
+def page(text: str) -> str:
+    """A notebook in Markdown for the site."""
+    cells = json.loads(text)["cells"]
     parts = []
     for cell in cells:
         source = "".join(cell["source"])
         parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
         parts += [_shown(output["data"]) for output in cell.get("outputs", [])]
-    return "\n\n".join(parts).split("\n", 1)[1]
+    return "\n\n".join(parts)
 
 
 def _shown(data: dict[str, Any]) -> str:

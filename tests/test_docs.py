@@ -94,7 +94,9 @@ def test_pages_messages_and_help_use_the_usual_words() -> None:
         *(ROOT / name for name in ("docs/CITATION.cff", "docs/benchmarks/rl_zoo.yml", "pyproject.toml")),
     ]
     texts = {str(path.relative_to(ROOT)): path.read_text("utf-8") for path in whole}
-    texts["the notebook"] = re.sub(r"base64,[^)\"]+", "", module_of("notebook").page())
+    for path in (ROOT / "docs").rglob("*.ipynb"):
+        page = module_of("notebook").page(path.read_text("utf-8"))
+        texts[str(path.relative_to(ROOT))] = re.sub(r"base64,[^)\"]+", "", page)
     found = {name: turns for name, text in texts.items() if (turns := unusual(text))}
     for path in sorted((ROOT / "gridworld").rglob("*.py")):
         tree = ast.parse(path.read_text("utf-8"))

@@ -1,5 +1,7 @@
 """The site builds without a warning, and no page is wider than the window."""
 
+import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -8,14 +10,16 @@ import pytest
 from helpers.browser import chromium
 from helpers.support import ROOT
 
+FORMULA = re.compile(r"\$\$.+?\$\$|\$.+?\$", re.DOTALL)
 WIDTHS = (390, 1280, 1440, 1600)
-PAGES = (  # by what may be too wide: a picture, tables, long commands, the tables of options, signatures
+PAGES = (  # by what may be too wide: pictures, tables, long commands, tables of options, signatures, formulas
     "index",
     "how-to/agents",
     "how-to/speed",
     "reference/results",
     "reference/options",
     "reference/api",
+    "course/lab1_values",
 )
 
 
@@ -26,6 +30,21 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = [sys.executable, "-m", "sphinx", "-q", "-W", str(ROOT / "docs"), str(folder)]
     subprocess.run(command, check=True, timeout=300)
     return folder
+
+
+@pytest.mark.slow
+def test_the_sheets_are_pages_whose_formulas_need_no_network(site: Path) -> None:
+    for sheet in (ROOT / "docs" / "course").glob("*.ipynb"):
+        page = (site / "course" / f"{sheet.stem}.html").read_text("utf-8")
+        assert page.count("<math") == sum(
+            len(FORMULA.findall("".join(cell["source"])))
+            for cell in json.loads(sheet.read_text("utf-8"))["cells"]
+            if cell["cell_type"] == "markdown"
+        )
+        assert not re.search(r'(?:src|rel="stylesheet" href)="http', page)
+        [notebook] = (site / "_downloads").rglob(sheet.name)
+        assert notebook.read_bytes() == sheet.read_bytes()
+    assert not (site / "course" / "solutions").exists()
 
 
 @pytest.mark.slow
