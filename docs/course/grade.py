@@ -12,7 +12,7 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from gridworld.base.signals import listen
@@ -59,19 +59,8 @@ def main(words: Sequence[str]) -> None:
 
     complete = True
     for student, notebook in notebooks.items():
-        results: list[Marked] = []
-        lines: list[str] = []
-        for each in grade(sheet, notebook, options.seconds, options.memory * 2**30):
-            if isinstance(each, str):
-                line = each
-            else:
-                results.append(each)
-                exercise, given, sentence = each
-                row = [exercise.title, f"{given}/{exercise.points}", f" {sentence}"]
-                [line] = aligned([row], _COLUMNS)
-            lines.append(printable(line))
-            if not several:
-                print(lines[-1], flush=True)
+        marked = grade(sheet, notebook, options.seconds, options.memory * 2**30)
+        results, lines = _followed(marked, show=not several)
         points = [given for _, given, _ in results]
         complete &= sum(points) == sheet.points
         lines.append(f"total: {sum(points)} of {sheet.points} points")
@@ -116,6 +105,22 @@ def find_notebooks(given: Sequence[Path]) -> dict[str, Path]:
             found.setdefault(whole_path, whole_path.parent)
     top = os.path.commonpath(found.values())
     return {str(path.relative_to(top).with_suffix("")): path for path in found}
+
+
+def _followed(marked: Iterable[str | Marked], show: bool) -> tuple[list[Marked], list[str]]:
+    """The results of a notebook, and a line for each note and each result, printed as they come if `show`."""
+    results: list[Marked] = []
+    lines: list[str] = []
+    for each in marked:
+        line = each
+        if not isinstance(each, str):
+            results.append(each)
+            exercise, points, sentence = each
+            [line] = aligned([[exercise.title, f"{points}/{exercise.points}", f" {sentence}"]], _COLUMNS)
+        lines.append(printable(line))
+        if show:
+            print(lines[-1], flush=True)
+    return results, lines
 
 
 def _is_hidden(path: Path) -> bool:
