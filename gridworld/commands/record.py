@@ -54,7 +54,7 @@ def _record(options: argparse.Namespace) -> None:
     drawn = {kind: drawer(MAPS[kind])(subject)(options.cell_size) for kind in formats if kind in MAPS}
     policy, limit = choose_policy(subject.snapshot, options.policy), evaluator.max_episode_steps
     episodes = [play(mdp, policy, limit, options.seed + index) for index in range(options.episodes)]
-    animation = film(saved.config.env, mdp, episodes, options.trust)(options.cell_size)
+    animation = film(saved.config.env, mdp, episodes, options.trust, limit)(options.cell_size)
     files.check_size(animation, formats)
     folder.mkdir(parents=True, exist_ok=True)
     for kind in formats:

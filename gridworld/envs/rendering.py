@@ -44,7 +44,7 @@ GOAL: Colour = (230, 180, 50)
 AGENT: Colour = (100, 100, 220)
 
 SMALLEST_TEXT = 10  # pixels
-_GREYS = 17  # steps between ink and paper at the edge of a letter
+GREYS = 18  # of letters, from paper to ink
 
 MAX_PIXELS = 64_000_000
 MAX_SIDE = 65_535  # pixels; GIF counts no further, and hardly a viewer does
@@ -335,16 +335,17 @@ def text_size(text: str, size: int, room: float) -> int | None:
 
 def write(surface: Any, text: str, left: int, middle: int, size: int) -> int:
     """Write a text on paper, in few greys for the palettes of animations; where it ends, in pixels."""
-    image = _in_greys(text, size)
+    image = in_greys(text, size)
     surface.blit(image, (left, middle - image.get_height() // 2))
     return left + int(image.get_width())
 
 
 @functools.lru_cache(maxsize=1 << 7)  # captions and legends of a run's pictures have many words in common
-def _in_greys(text: str, size: int) -> Any:
+def in_greys(text: str, size: int) -> Any:
+    """A text in black; the opacity of its pixels is one of `GREYS` steps."""
     image = font(size).render(text, True, INK)
     alpha = import_pygame().surfarray.pixels_alpha(image)
-    step = 255 // (_GREYS - 1)
+    step = 255 // (GREYS - 1)
     alpha[...] = alpha // step * step
     del alpha  # unlocks the image
     return image

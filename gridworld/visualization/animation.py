@@ -7,7 +7,7 @@ pixel stays exact; maps, whose shapes have smooth edges, and what another librar
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,7 +19,6 @@ from gridworld.base.bounds import positive_int
 from gridworld.base.errors import InputError
 from gridworld.envs import rendering as drawing
 from gridworld.envs.rendering import Frame, Packed
-from gridworld.envs.rollout import Episode
 from gridworld.world.mdp import IntArray, Mdp
 
 _MOST_COLOURS = 256
@@ -30,6 +29,7 @@ _SAMPLED = 3_000_000  # bytes of all frames that a common palette is made from
 
 Picture = NDArray[np.uint8]  # (height, width), numbers of colours
 Palette = NDArray[np.uint8]  # (colours, 3), RGB
+Caption = tuple[str, ...]  # lines
 Encoded = dict[tuple[object, ...], bytes]  # parts of files, by the keys of the pictures that they depend on
 
 
@@ -37,8 +37,8 @@ Encoded = dict[tuple[object, ...], bytes]  # parts of files, by the keys of the 
 class Animation:
     """Pictures one after the other, at least one."""
 
-    keys: Sequence[int]  # one per picture; equal keys are equal pictures
-    draw: Callable[[int], Image.Image]  # a fresh palette image for a key, all of one size and palette
+    keys: Sequence[Hashable]  # one per picture; equal keys are equal pictures
+    draw: Callable[[Any], Image.Image]  # a fresh palette image for a key, all of one size and palette
     encoded: Encoded = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -57,34 +57,49 @@ def automatic_cell_size(mdp: Mdp, cell_size: int | None = None) -> int:
     return positive_int("cell_size", cell_size)
 
 
-def animation_of_states(mdp: Mdp, states: IntArray, cell_size: int | None = None) -> Animation:
-    """Show the agent in one state (pictures,) after the other."""
+def animation_of_states(
+    mdp: Mdp, states: IntArray, cell_size: int | None = None, captions: Sequence[Caption] = ()
+) -> Animation:
+    """Show the agent in one state (pictures,) after the other, with captions in the lower border."""
     size = automatic_cell_size(mdp, cell_size)
     empty, palette, encoded = _empty_board(mdp, size)
     if sum(map(len, encoded.values())) > _MOST_ENCODED:
         encoded.clear()
 
-    def draw(state: int) -> Image.Image:
-        left, top, width, height = drawing.agent_box(mdp, state, size)
+    def draw(key: tuple[int, Caption]) -> Image.Image:
+        left, top, width, height = drawing.agent_box(mdp, key[0], size)
         picture = empty.copy()
-        picture[top : top + height, left : left + width] = 0  # the palette's first
+        picture[top : top + height, left : left + width] = 0  # the palette's first; greys follow
+        for number, line in enumerate(key[1]):
+            fitting = drawing.text_size(line, min(round(0.4 * size), 20), picture.shape[1] - size - 4)
+            if fitting is not None:
+                alpha = drawing.import_pygame().surfarray.array_alpha(drawing.in_greys(line, fitting)).T
+                top = picture.shape[0] - size + round((0.3 + 0.4 * number) * size) - alpha.shape[0] // 2
+                place = picture[top : top + alpha.shape[0], size : size + alpha.shape[1]]
+                place[...] = 1 + alpha[: place.shape[0]] // (255 // (drawing.GREYS - 1))
         return _image(picture, palette)
 
-    return Animation(states.tolist(), draw, encoded)
+    keys = zip(states.tolist(), captions or [()] * len(states), strict=True)
+    return Animation(list(keys), draw, encoded)
 
 
 @functools.lru_cache(maxsize=2)  # of the files, and of TensorBoard
 def _empty_board(mdp: Mdp, size: int) -> tuple[Picture, Palette, Encoded]:
     """What the episodes of all runs in a world have in common."""
-    numbered = _number([drawing.draw_frame(mdp, None, size)], first=[drawing.AGENT, drawing.BACKGROUND])
+    greys = np.linspace(255, 0, drawing.GREYS, dtype=int).tolist()
+    colours = [drawing.AGENT, *((grey,) * 3 for grey in greys)]
+    numbered = _number([drawing.draw_frame(mdp, None, size)], first=colours)
     assert numbered is not None  # colours of walls, cliffs, ends, lines and the greys of letters
     return numbered[0][0], numbered[1], {}
 
 
-def animation_of_cards(mdp: Mdp, episodes: Sequence[Episode], cell_size: int | None = None) -> Animation:
-    """Show episodes in text: each picture has a state, the action taken there, and the reward so far."""
+def animation_of_cards(
+    mdp: Mdp, states: IntArray, cell_size: int | None = None, captions: Sequence[Caption] = ()
+) -> Animation:
+    """Show states (pictures,) in text: their names, and captions below these."""
     frame_size = drawing.frame_size(mdp, automatic_cell_size(mdp, cell_size))
-    cards = [lines for episode in episodes for lines in _cards(mdp, episode)]
+    names = map(mdp.state_name, states.tolist())
+    cards = [(name, *caption) for name, caption in zip(names, captions, strict=True)]
     greys = np.repeat(np.arange(_MOST_COLOURS, dtype=np.uint8)[:, None], 3, axis=1)
 
     def draw(index: int) -> Image.Image:
@@ -93,15 +108,6 @@ def animation_of_cards(mdp: Mdp, episodes: Sequence[Episode], cell_size: int | N
         return _image(np.ascontiguousarray(drawing.surface_to_frame(surface)[..., 0]), greys)
 
     return Animation(range(len(cards)), draw)
-
-
-def _cards(mdp: Mdp, episode: Episode) -> Iterator[tuple[str, ...]]:
-    actions = [f"action {mdp.action_names[action]}" for action in episode.actions.tolist()]
-    earned = np.concatenate([[0.0], np.cumsum(episode.rewards)]).tolist()
-    for step, state in enumerate(episode.states.tolist()):
-        end = "goal" if mdp.goal[state] else "the end" if mdp.terminal[state] else "the step limit"
-        what = actions[step] if step < len(actions) else end
-        yield mdp.state_name(state), f"step {step}: {what}", f"reward so far {earned[step]:.6g}"
 
 
 def animation_of_frames(frames: Iterable[Frame | Packed], likely: Iterable[Sequence[int]] = ()) -> Animation:
@@ -124,10 +130,26 @@ def animation_of_frames(frames: Iterable[Frame | Packed], likely: Iterable[Seque
 
 
 def animation_of_rendered(
-    frames: Sequence[Frame], keys: Sequence[int], longest_side: int | None = None
+    frames: Sequence[Frame],
+    keys: Sequence[int],
+    longest_side: int | None = None,
+    captions: Sequence[Caption] = (),
 ) -> Animation:
-    """Show the frame of each key, scaled down to `longest_side` pixels, and quantised, where necessary."""
+    """Show the frame of each key, scaled down to `longest_side` pixels, and quantised, where necessary.
+
+    Captions, one a frame, are written below them where there is room for them.
+    """
     pictures = [_scaled_down(frame, longest_side) for frame in frames]
+    room, lines = pictures[0].shape[1] - 8, [line for caption in captions for line in caption]
+    sizes = [drawing.text_size(line, 16, room) for line in lines]
+    if sizes and None not in sizes:
+        size = min(size for size in sizes if size is not None)
+        below = drawing.import_pygame().Surface((room + 8, 3 * size))
+        for index, caption in enumerate(captions):
+            below.fill(drawing.BACKGROUND)
+            for number, line in enumerate(caption):
+                drawing.write(below, line, 4, round((0.85 + 1.3 * number) * size), size)
+            pictures[index] = np.concatenate([pictures[index], drawing.surface_to_frame(below)])
     if (numbered := _number(pictures)) is not None:
         numbers, palette = numbered
         return Animation(keys, lambda key: _image(numbers[key], palette))

@@ -16,14 +16,16 @@ from PIL import Image
 from gridworld.base.console import printable, tell
 from gridworld.base.errors import InputError, in_short
 from gridworld.config.worlds import EnvConfig, GymnasiumConfig
-from gridworld.envs.rendering import Frame, board_of, frame_size, import_pygame
+from gridworld.envs.rendering import Frame, Kind, board_of, frame_size, import_pygame
 from gridworld.envs.rollout import Episode, play
 from gridworld.visualization.animation import (
     Animation,
+    Caption,
     animation_of_cards,
     animation_of_rendered,
     animation_of_states,
 )
+from gridworld.visualization.canvas import directions
 from gridworld.visualization.picture import Draw, Subject
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources.environment import make_env
@@ -41,20 +43,22 @@ def episode(subject: Subject) -> Draw:
     config, mdp = subject.config, subject.evaluator.mdp
     policy, limit = subject.snapshot.greedy_policy(), subject.evaluator.max_episode_steps
     played = play(mdp, policy, limit, config.seed).beginning(_MOST_FRAMES)
-    drawn = film(config.env, mdp, [played], subject.is_trusted)
+    drawn = film(config.env, mdp, [played], subject.is_trusted, limit)
     return functools.cache(  # several files show the same
         lambda cell_size: drawn(cell_size or config.recording.cell_size)
     )
 
 
 def film(
-    env: EnvConfig, mdp: Mdp, episodes: Sequence[Episode], is_trusted: bool
+    env: EnvConfig, mdp: Mdp, episodes: Sequence[Episode], is_trusted: bool, max_episode_steps: int
 ) -> Callable[[int | None], Animation]:
     """Prepare an animation of episodes, one after the other, as a function of a cell size in pixels.
 
     The frames are those of the environment that `env` names, where `is_trusted` allows to make it; they are
-    scaled down where they are larger than the board would be with cells of that size.
+    scaled down where they are larger than the board would be with cells of that size. Captions say what
+    happens.
     """
+    captions = [lines for episode in episodes for lines in _captions(mdp, episode, max_episode_steps)]
     if isinstance(env, GymnasiumConfig) and not is_trusted:
         tell(
             printable(f"the episode is drawn from the run's tables; {env.id} itself is only drawn with trust")
@@ -66,12 +70,48 @@ def film(
             _log.warning("the episode is drawn from the tables, not by its environment: %s", error)
         else:
             return lambda cell_size: animation_of_rendered(
-                frames, range(len(frames)), None if cell_size is None else max(frame_size(mdp, cell_size))
+                frames,
+                range(len(frames)),
+                None if cell_size is None else max(frame_size(mdp, cell_size)),
+                captions,
             )
-    if board_of(mdp).panels:
-        states = np.concatenate([each.states for each in episodes])
-        return lambda cell_size: animation_of_states(mdp, states, cell_size)
-    return lambda cell_size: animation_of_cards(mdp, episodes, cell_size)
+    states = np.concatenate([each.states for each in episodes])
+    show = animation_of_states if board_of(mdp).panels else animation_of_cards
+    return lambda cell_size: show(mdp, states, cell_size, captions)
+
+
+def _captions(mdp: Mdp, episode: Episode, max_episode_steps: int) -> Iterator[Caption]:
+    """What an episode has come to at each of its states, and what happens there."""
+    earned = np.concatenate([[0.0], np.cumsum(episode.rewards)]).tolist()
+    states, actions, ways = episode.states.tolist(), episode.actions.tolist(), directions(mdp)
+    last = "the goal" if mdp.goal[states[-1]] else "a trap" if mdp.trap[states[-1]] else "the end"
+    if not mdp.terminal[states[-1]]:
+        last = "out of steps" if len(actions) == max_episode_steps else "and so on"
+    moves = [
+        _move(mdp, ways[state, action].tolist(), mdp.action_names[action], state, following)
+        for action, (state, following) in zip(actions, pairwise(states), strict=True)
+    ]
+    for step, what in enumerate([*moves, last]):
+        yield f"step {step} of {max_episode_steps}, return {earned[step]:.6g}", what
+
+
+def _move(mdp: Mdp, way: list[int], name: str, state: int, following: int) -> str:
+    """What an action with an arrow that points that `way` did."""
+    board = board_of(mdp)
+    if not any(way):
+        return f"action {name}"
+    place, reached = board.cell[state], board.cell[following]
+    if (reached == place + way).all():
+        return f"moves {name}"
+    if (reached != place).any():
+        return f"moves {name}, comes to {mdp.state_name(following)}"
+    row, col = (place + way).tolist()
+    is_inside = 0 <= row < board.rows and 0 <= col < board.cols
+    kind = board.kind[row, col] if is_inside else Kind.BLANK
+    if kind == Kind.BLANK:
+        return f"moves {name} into the border"
+    is_wall = kind == Kind.WALL or (kind != Kind.UNREACHABLE and not mdp.is_stochastic)
+    return f"moves {name} into a wall" if is_wall else f"moves {name}, but stays"  # slips, or falls back
 
 
 def rendered_frames(

@@ -243,7 +243,7 @@ def test_an_episode_in_text_tells_state_action_and_reward() -> None:
     assert played.actions.tolist() == [1, 1, 1]
     assert played.rewards.tolist() == [-0.5, -0.5, 1.0]
     assert played.beginning(2).actions.tolist() == [1]
-    told = film(EnvConfig(), world, [played, played], True)(None)
+    told = film(EnvConfig(), world, [played, played], True, 10)(None)
     assert len(told) == 8
     pictures = [np.asarray(told.draw(key).convert("RGB")) for key in told.keys]
     assert np.array_equal(pictures[0], pictures[4])
@@ -263,7 +263,7 @@ def test_an_episode_shows_the_frames_of_the_environment(monkeypatch: pytest.Monk
     monkeypatch.setattr(episode, "rendered_frames", _noisy)
     env = GymnasiumConfig(id="FrozenLake-v1")
     walk = Episode(np.array([2, 0, 2, 1]), np.zeros(3, dtype=int), np.zeros(3))
-    prepared = film(env, FROZEN_LAKE, [walk], True)
+    prepared = film(env, FROZEN_LAKE, [walk], True, 100)
     shown = prepared(None)
     assert shown.size == (80, 40)
     pictures = [np.asarray(shown.draw(key).convert("RGB")).astype(int) for key in shown.keys]
@@ -357,3 +357,40 @@ def test_an_environment_that_draws_nothing_says_so(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(gym.registry, "Plain-v0", spec)
     with pytest.raises(InputError, match=r"^env.id=Plain-v0: draws no pictures; rgb_array is not among"):
         frames_of("Plain-v0", [36], CLIFF_WALKING)
+
+
+# ---- what captions of an episode say -----------------------------------------------------------------------
+
+
+def captions(
+    mdp: Mdp, states: list[int], actions: list[int], limit: int, monkeypatch
+) -> list[tuple[str, str]]:
+    monkeypatch.setattr(episode, "animation_of_states", lambda mdp, states, size, captions: captions)
+    rewards = mdp.reward[states[:-1], actions, 0]
+    told: Any = film(EnvConfig(), mdp, [Episode(np.array(states), np.array(actions), rewards)], True, limit)
+    return list(told(None))
+
+
+def test_captions_say_what_an_agent_does_that_does_not_move(monkeypatch: pytest.MonkeyPatch) -> None:
+    classic, rooms = compile_mdp(load("classic")), compile_mdp(load("four_rooms"))
+    assert captions(classic, [0, 0, 1, 0], [3, 1, 3], 3, monkeypatch) == [
+        ("step 0 of 3, return 0", "moves left into the border"),
+        ("step 1 of 3, return 0", "moves right"),
+        ("step 2 of 3, return 0", "moves left"),
+        ("step 3 of 3, return 0", "out of steps"),
+    ]
+    assert captions(classic, [17, 16], [3], 100, monkeypatch)[-1] == ("step 1 of 100, return 1", "the goal")
+    assert captions(classic, [4, 10], [2], 100, monkeypatch)[-1] == ("step 1 of 100, return -1", "a trap")
+    beside = int(np.flatnonzero(rooms.wall & ~np.roll(rooms.wall, 1))[0]) - 1  # a wall is on its right
+    assert captions(rooms, [beside, beside], [1], 9, monkeypatch)[0][1] == "moves right into a wall"
+
+
+def test_captions_say_where_chance_and_falls_lead(monkeypatch: pytest.MonkeyPatch) -> None:
+    slipped = captions(FROZEN_LAKE, [0, 1, 1], [1, 1], 100, monkeypatch)
+    assert [what for _, what in slipped] == [
+        f"moves down, comes to {FROZEN_LAKE.state_name(1)}",
+        "moves down, but stays",
+        "and so on",
+    ]
+    assert captions(CLIFF_WALKING, [36, 36], [1], 9, monkeypatch)[0][1] == "moves right, but stays"
+    assert captions(TAXI, [1, 1], [4], 9, monkeypatch)[0][1] == f"action {TAXI.action_names[4]}"
