@@ -267,7 +267,9 @@ def show_progress(progress: Progress, evaluation: Evaluation) -> None:
 
 
 def _greedy_tag(metric: Metric) -> str:
-    return f"{GREEDY if metric.in_front else GREEDY_MORE}/{metric.name}"
+    """SB3's name for a metric where it has one: a second chart of the same numbers would be no help."""
+    front = metric.in_front or metric.sb3_name
+    return f"{GREEDY if front else GREEDY_MORE}/{metric.sb3_name or metric.name}"
 
 
 def _charts() -> dict[str, list[str]]:
@@ -295,10 +297,9 @@ class CurveScalars:
         }
 
     def write(self, evaluation: Evaluation) -> None:
-        """Write one event with a value for every tag; SB3's names for metrics are tags too."""
+        """Write one event with a value for every tag."""
         greedy = [(metric, float(metric.of(evaluation.greedy))) for metric in METRICS]
         tags = self._optimum | {_greedy_tag(metric): number for metric, number in greedy}
-        tags |= {f"{GREEDY}/{metric.sb3_name}": number for metric, number in greedy if metric.sb3_name}
         tags |= {f"{SAMPLED}/{name}": float(number) for name, number in numbers(evaluation.sampled).items()}
         for metric in TRAINING_METRICS:
             if (number := metric.of(evaluation.returns)) is not None:

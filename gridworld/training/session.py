@@ -45,7 +45,7 @@ from gridworld.training.learning_curve import (
 )
 from gridworld.training.pictures import Pictures
 from gridworld.training.setup import make_context
-from gridworld.training.tensorboard import EventWriter, as_markdown, hparams
+from gridworld.training.tensorboard import HOW_TO_READ, EventWriter, as_markdown, hparams
 from gridworld.training.together import Training
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import EXACT, Mdp
@@ -175,6 +175,7 @@ class Session:
         if self._events is not None:
             self._events.hparams(hparams(self._config))
             self._events.charts("greedy and sampled policy with the optimum", CHARTS)
+            self._events.text("run/how_to_read", HOW_TO_READ, 0)
             self._events.text("run/command", f"    {shlex.join(self._run.manifest['command'])}", 0)
             self._events.text("run/settings", as_markdown(dataclasses.asdict(self._config)), 0)
         self._curve.evaluate(0)

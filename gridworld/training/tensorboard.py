@@ -36,6 +36,11 @@ from gridworld.config.train import TrainConfig
 
 HParamValue = bool | float | str | None
 
+HOW_TO_READ = (  # of what TensorBoard does to curves by default
+    "Set *Smoothing* to 0 and switch *Ignore outliers in chart scaling* off: these values are exact. "
+    "`train`, `rollout` and `online` alone are samples."
+)
+
 _AS_EVENT = 48  # bytes of memory that a byte of a record may come to, in a list of empty values
 _HEADER, _FOOTER = 12, 4  # bytes before and after an event
 _VERSION = "brain.Event:2"

@@ -28,7 +28,9 @@ class Metric:
     label: str  # in tables
     of: Callable[[Score], float]
     in_front: bool = False  # in TensorBoard's first group, `eval`
-    sb3_name: str | None = None  # what SB3's evaluation calls it, in TensorBoard beside our name
+    sb3_name: str | None = (
+        None  # what SB3's evaluation calls it, and TensorBoard's curve of the greedy policy
+    )
     chart: str | None = None  # of TensorBoard's Custom Scalars tab
     is_headline: bool = False  # in the table at a run's end, if in any
     has_optimum: bool = False  # the optimum's is written too, as optimal_<name>
@@ -96,7 +98,6 @@ METRICS = (
         "goal_probability",
         "goal probability",
         lambda score: score.outcome.goal,
-        in_front=True,
         sb3_name="success_rate",
         chart="goal probability",
         is_headline=True,
