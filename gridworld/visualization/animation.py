@@ -7,7 +7,7 @@ pixel stays exact; maps, whose shapes have smooth edges, and what another librar
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -37,7 +37,7 @@ Encoded = dict[tuple[object, ...], bytes]  # parts of files, by the keys of the 
 class Animation:
     """Pictures one after the other, at least one."""
 
-    keys: Sequence[Hashable]  # one per picture; equal keys are equal pictures
+    keys: Sequence[Any]  # one per picture; equal keys are equal pictures
     draw: Callable[[Any], Image.Image]  # a fresh palette image for a key, all of one size and palette
     encoded: Encoded = field(default_factory=dict)
 
