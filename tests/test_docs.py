@@ -113,7 +113,7 @@ def test_pages_messages_and_help_use_the_usual_words() -> None:
 def test_the_pictures_are_the_ones_that_a_command_draws() -> None:
     figures = module_of("figures")
     assert {path.name for path in figures.IMAGES.iterdir()} == set(figures.SOURCES)
-    assert sum(path.stat().st_size for path in figures.IMAGES.iterdir()) < 400_000
+    assert sum(path.stat().st_size for path in figures.IMAGES.iterdir()) < 600_000
     for line in figures.COMMANDS.splitlines():
         check(line)
 
