@@ -161,7 +161,7 @@ class Canvas(Sheet):
     def mark(self, states: IntArray, colour: Colour) -> None:
         """A frame inside each of these cells, edged in white; a dot where the cells are small."""
         rect, cell = drawing.import_pygame().draw.rect, self.cell
-        thick, dot = max(1, cell // 20), max(1, cell // 2)
+        thick, dot = max(1, cell // 16), max(1, cell // 2)
         for state in states.tolist():
             left, top = (round(side) for side in self.point(state, 0, 0))
             if not self.has_grid:
