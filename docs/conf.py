@@ -42,6 +42,7 @@ MOVED = {  # by the address that a page had
     "tutorials/cluster": "../how-to/cluster.html",
     "how-to/environment": "worlds.html#maps-and-the-environment-without-the-rest",
     "how-to/ten-thousand-runs": "cluster.html#ten-thousand-runs",
+    "reference/rooms": "how-a-run-works.html#the-rooms",
     "tutorials/tuning": "../how-to/tuning.html",
 }
 
