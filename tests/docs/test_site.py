@@ -14,9 +14,11 @@ FORMULA = re.compile(r"\$\$.+?\$\$|\$.+?\$", re.DOTALL)
 WIDTHS = (390, 1280, 1440, 1600)
 PAGES = (  # by what may be too wide: pictures, tables, long commands, tables of options, signatures, formulas
     "index",
+    "faq",
     "how-to/agents",
     "how-to/speed",
     "reference/results",
+    "reference/optimal-values",
     "reference/options",
     "reference/api",
     "course/lab1_values",
