@@ -190,7 +190,8 @@ def is_world(env: EnvConfig, name: str) -> bool:
         return False
     own = dataclasses.asdict(type(env)()) | yaml.safe_load(file.read_text("utf-8"))
     given = dataclasses.asdict(env)
-    return all(own[key] == given[key] for key in given.keys() - {"max_episode_steps", "recipes_of"})
+    keys = (own.keys() | given.keys()) - {"defaults", "max_episode_steps", "recipes_of"}
+    return all(key in given and own[key] == given[key] for key in keys)
 
 
 def recipe_note(config: TrainConfig, mdp: Mdp) -> str | None:

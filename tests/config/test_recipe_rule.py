@@ -11,6 +11,7 @@ import gridworld
 from gridworld.agents.sb3.settings import REPLAY_COUNTS
 from gridworld.base.errors import InputError
 from gridworld.config.compose import compose
+from gridworld.config.recipes import is_world
 from gridworld.config.train import TrainConfig
 from gridworld.training.setup import check_settings, notes
 
@@ -198,3 +199,13 @@ def test_a_small_stochastic_world_is_certified(tmp_path: Path) -> None:
     summary = train_in(tmp_path, "agent=q_learning", *world, *NO_FILES)
     assert (summary["certified"], summary["recipe"]) == (True, "q_learning/stochastic")
     assert summary["privileges"] == ["starts anywhere", "stratified draws"]
+
+
+def test_each_world_is_its_own_file_and_no_other() -> None:
+    """Where settings of another kind of world are missing, too."""
+    files = sorted(file.stem for file in CONF.glob("env/*.yaml"))
+    worlds = [name for name in files if name not in ("arrays", "built", "enumerated", "gymnasium")]
+    assert len(worlds) > 15
+    for name in worlds:
+        env = compose([f"env={name}"]).env
+        assert [file for file in files if is_world(env, file)] == [name]
