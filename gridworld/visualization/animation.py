@@ -76,7 +76,8 @@ def animation_of_states(
                 alpha = drawing.import_pygame().surfarray.array_alpha(drawing.in_greys(line, fitting)).T
                 top = picture.shape[0] - size + round((0.3 + 0.4 * number) * size) - alpha.shape[0] // 2
                 place = picture[top : top + alpha.shape[0], size : size + alpha.shape[1]]
-                place[...] = 1 + alpha[: place.shape[0]] // (255 // (drawing.GREYS - 1))
+                height, width = place.shape  # letters may be a few pixels wider than they say
+                place[...] = 1 + alpha[:height, :width] // (255 // (drawing.GREYS - 1))
         return _image(picture, palette)
 
     keys = zip(states.tolist(), captions or [()] * len(states), strict=True)

@@ -67,7 +67,7 @@ def test_the_environment_of_a_run_is_made_with_trust_only(trust: bool, folder: P
         assert (told in done.stderr) == (not trust)
         with Image.open(run / film) as picture:
             sizes[film] = picture.size
-    assert ((256, 256) in sizes.values()) == trust  # of its own frames
+    assert ((256, 304) in sizes.values()) == trust  # of its own frames, with captions below
     assert len(set(sizes.values())) == 1
 
 

@@ -20,7 +20,7 @@ PRINTED = {
     "exact_callback_with_plain_sb3.py": "the best model: regret 0.000, certified optimal: True",
     "score_your_own_table.py": "certified optimal",
     "family_of_worlds.py": "| all | 1 | 1 | 1 | 1 |",
-    "check_a_numpy_agent.py": "train: passed all 11 probes",
+    "check_a_numpy_agent.py": "train: passed all 14 probes",
     "optimal_values.py": "| CliffWalking-v1 | 1 | -13.000000 | -13.000000 | 13.00 | 100.0 % |",
 }
 ARGUMENTS = {

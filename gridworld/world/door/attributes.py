@@ -17,8 +17,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from gridworld.world.door.unread import Unread
-
 _LIBRARIES = ("gymnasium", "numpy", "pygame", "stable_baselines3", "torch", "gridworld")
 _DEEP = 4  # lists in lists, objects in objects
 _NOT_PLAIN = (
@@ -49,7 +47,7 @@ def attributes(thing: Any) -> dict[str, Any]:
 
 def held_by(thing: Any, name: str = "", depth: int = _DEEP) -> Iterator[tuple[str, Any]]:
     """What an object holds, and what is held there, by their names: robot.place, robots[0].place."""
-    if type(thing) is Unread or depth < 0:
+    if getattr(type(thing), "is_stand_in", False) or depth < 0:
         return
     if is_plain(thing) or isinstance(thing, GENERATORS):
         yield name, thing

@@ -21,12 +21,12 @@ class Seen:
     """The observations that were met, by their digests.
 
     Args:
-        space: of the observations.
+        env: shows them; its space may be set as late as in a reset.
         refusal: makes an error of a reason.
     """
 
-    def __init__(self, space: gym.Space[Any], refusal: Callable[[str], InputError]) -> None:
-        self._space, self._refusal = space, refusal
+    def __init__(self, env: gym.Env[Any, Any], refusal: Callable[[str], InputError]) -> None:
+        self._env, self._refusal = env, refusal
         self.parts: dict[bytes, Any] = {}
         self.texts: dict[bytes, str] = {}  # empty where they are long
         self.num_bytes = 0
@@ -38,7 +38,7 @@ class Seen:
         with contextlib.suppress(TypeError):  # of a tuple of what has no hash
             if may_be_met and (met := self._met.get(observation)):
                 return met
-        parts = list(leaves(observation, self._space, self._refusal))  # whose sizes are known
+        parts = list(leaves(observation, self._env.observation_space, self._refusal))  # whose sizes are known
         whole = b"".join(each.tobytes() if isinstance(each, np.ndarray) else each for each in parts)
         seen = whole if len(whole) <= 16 else hashlib.blake2b(whole, digest_size=17).digest()
         if seen not in self.parts:

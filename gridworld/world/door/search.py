@@ -108,7 +108,7 @@ class Search:
         except Exception as error:  # of its own
             reason = f"its __getattr__ raises {in_short(error)}, must raise AttributeError"
             raise self.refusal(reason) from error
-        self.seen = Seen(env.observation_space, self.refusal)
+        self.seen = Seen(env, self.refusal)
         self.is_cutting = False  # whether steps are tried as they are at a limit
         self.limit_met: int | None = None  # the time at which it cuts episodes, where the time is no state
         self.budget = Budget(self, most_states, most_seconds)

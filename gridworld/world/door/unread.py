@@ -122,6 +122,8 @@ class Unread:
     `form` says that it is the first times what the attribute was when the run began, plus the second.
     """
 
+    is_stand_in = True
+
     def __init__(self, counter: Counter, form: tuple[int, int] | None) -> None:
         self.counter, self.form = counter, form
 
