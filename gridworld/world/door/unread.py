@@ -9,6 +9,7 @@ else is done with a stand-in raises `Read`, and then the number is state.
 
 from __future__ import annotations
 
+import functools
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
@@ -164,13 +165,9 @@ def _is_whole(number: Any) -> bool:
     return bool(abs(number) <= _EXACT and number == int(number))
 
 
-def _method(work: Callable[..., Any], name: str) -> Callable[[Unread, Any], Any]:
-    return lambda self, other: work(self, name, other)
-
-
 for _name in ("add", "radd", "sub", "rsub", "mul", "rmul"):
-    setattr(Unread, f"__{_name}__", _method(Unread._counted, _name))
+    setattr(Unread, f"__{_name}__", functools.partialmethod(Unread._counted, _name))
 for _name in _COMPARISONS:
-    setattr(Unread, f"__{_name}__", _method(Unread._compared, _name))
+    setattr(Unread, f"__{_name}__", functools.partialmethod(Unread._compared, _name))
 for _name in _READING:
     setattr(Unread, f"__{_name}__", Unread._read)
