@@ -72,11 +72,7 @@ class Branching:
         self._decisions, self._taken = [], []
         shares: dict[Result, dict[int, int]] = {}  # numerators by denominators, which is fast
         for number in range(MOST_BRANCHES):
-            if time.monotonic() > self.until:
-                raise InputError(
-                    f"{self._where}: a reset or a step has more random outcomes than can be tried in the "
-                    f"time allowed: after {number:,} there are more"
-                )
+            self.check_time(number)
             result = self._ran(step)
             numerator, denominator = self._share()
             of_result = shares.setdefault(result, {})
@@ -97,6 +93,14 @@ class Branching:
                 }
             self._taken[-1] += 1
         raise InputError(f"{self._where}: one step has more than {MOST_BRANCHES:,} random outcomes")
+
+    def check_time(self, number: int) -> None:
+        """Refuse to go on after so many outcomes where the time is over."""
+        if time.monotonic() > self.until:
+            raise InputError(
+                f"{self._where}: a reset or a step has more random outcomes than can be tried in the "
+                f"time allowed: after {number:,} there are more"
+            )
 
     def first(self, step: Callable[[], Result]) -> Result:
         """The result of a step in which every draw has its first outcome."""

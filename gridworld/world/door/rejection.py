@@ -207,7 +207,8 @@ class Rejecting(Branching):
         self._decisions, self._taken, self._met = [], [], {}
         leaves: list[Leaf] = []
         again = set[_Place]()
-        for _ in range(MOST_BRANCHES):
+        for number in range(MOST_BRANCHES):
+            self.check_time(number)
             result: dict[Any, Fraction]
             try:
                 result = {(self._ran(step),): Fraction(1)}
@@ -230,6 +231,7 @@ class Rejecting(Branching):
         follows = {place: self._following(leaves, place.way) for place in again}
         whole = self._fold(leaves, 0)
         for place in follows:
+            self.check_time(len(leaves))
             self._substitute(place, follows, whole)
         if self._remembers:
             self._known |= {place.place: found for place, found in follows.items()}
@@ -239,6 +241,7 @@ class Rejecting(Branching):
 
     def _following(self, leaves: list[Leaf], way: Way) -> dict[Any, Fraction]:
         """What follows a draw, by the way to it."""
+        self.check_time(len(leaves))
         depth, taken = way
         return self._fold([each for each in leaves if tuple(t for _, t in each[0][:depth]) == taken], depth)
 

@@ -960,9 +960,24 @@ class Retries(gym.Env):
         return self.goal, 0.0, True, False, {}
 
 
-def test_a_reset_with_too_many_outcomes_is_refused_within_its_time():
+class Scattered(Retries):
+    """Seven different cells, each drawn until it is new."""
+
+    def reset(self, *, seed=None, options=None):
+        super(Retries, self).reset(seed=seed)
+        self.taken = set()
+        for _ in range(7):
+            self.goal = self._cell()
+            while self.goal in self.taken:
+                self.goal = self._cell()
+            self.taken.add(self.goal)
+        return self.goal, {}
+
+
+@pytest.mark.parametrize("env", [Retries, Scattered])
+def test_a_reset_with_too_many_outcomes_is_refused_within_its_time(env):
     with pytest.raises(InputError, match="more random outcomes than can be tried in the time allowed: after"):
-        gridworld.compile_env(Retries, most_seconds=0.5)
+        gridworld.compile_env(env, most_seconds=0.5)
 
 
 class Optional(gym.Env):
