@@ -48,22 +48,10 @@ def hidden(seen: Seen) -> tuple[str, str] | None:
     return None if seen.steps.draws else _by_conflict(seen)
 
 
-class _States(Search):
-    """A search that keeps the copies of all states."""
-
-    copies: dict[int, bytes]
-
-    def _added(self, copy: bytes, depth: int) -> State:
-        state = super()._added(copy, depth)
-        if state.number == 0:
-            self.copies = {}
-        self.copies[state.number] = copy
-        return state
-
-
 def _by_states(seen: Seen) -> tuple[str, str] | None:
     """Compare the outcomes in states that show the same, exactly, and what tells these states apart."""
-    search = _States("env", seen.make(), most_states=_MOST_STATES, most_seconds=_SECONDS, compares=False)
+    bounds: Any = {"most_states": _MOST_STATES, "most_seconds": _SECONDS}
+    search = Search("env", seen.make(), **bounds, compares=False, keeps_copies=True)
     try:
         search.explore()
     except Exception:  # its code may be anybody's
@@ -135,7 +123,7 @@ def _outcomes_in(state: State) -> tuple[frozenset[Any], ...]:
     return tuple(outcomes)
 
 
-def _names(search: _States, conflicts: dict[bytes, dict[Any, list[int]]]) -> str:
+def _names(search: Search, conflicts: dict[bytes, dict[Any, list[int]]]) -> str:
     """The fewest attributes in which two states of one observation, with different outcomes, differ."""
     counts: Counter[tuple[str, ...]] = Counter()
     for found in islice(conflicts.values(), _LOOKED_AT):
@@ -149,8 +137,8 @@ def _names(search: _States, conflicts: dict[bytes, dict[Any, list[int]]]) -> str
     return ", ".join(names) if len(names) <= _NAMED else ""
 
 
-def _values(search: _States, state: int) -> dict[str, bytes]:
-    search.layers.put(search.copies[state])
+def _values(search: Search, state: int) -> dict[str, bytes]:
+    search.layers.put(search.states[state].copy)
     held = (each for layer in search.layers.layers for each in held_by(layer))
     return {name: content(value) for name, value in held if is_plain(value)}
 

@@ -24,6 +24,7 @@ from gridworld.base.errors import in_short
 from gridworld.world.door.attributes import (
     GENERATORS,
     differing,
+    generators_of,
     held_by,
     holders_of,
     innermost,
@@ -170,7 +171,7 @@ def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
         try:
             observation, _ = env.reset(seed=seed if episode == 0 else None)
             key = content(observation)
-            generators = generators_of(env)[2:] if len(rows) < _WATCHED else []
+            generators = all_generators(env)[2:] if len(rows) < _WATCHED else []
             for taken, action in enumerate(actions.of_episode(episode)):
                 before = number(observation, key)
                 states = _states(env, generators) if len(rows) < _WATCHED else None
@@ -225,7 +226,7 @@ def replays(make: Callable[[], Env], actions: Actions, sampled: Steps, rate: flo
         if new == plays(make(), lists):
             found.survivors = _survivors(make(), env)
         else:  # made or drawn from as the environment is made, or by a reset
-            own = [name for name, _ in generators_of(env) if name.startswith(_ITS)]
+            own = [name for name, _ in all_generators(env) if name.startswith(_ITS)]
             found.causes += [name for name in own if name not in found.causes]
     elif not found.causes:
         _try_ends(found, make, sampled, _ENDED * rate, (lists[0], base[0][0]))
@@ -287,15 +288,14 @@ def _play(env: Env, actions: Sequence[Any], seed: int, drawn: set[str], other: s
     return found
 
 
-def generators_of(env: Env) -> list[tuple[str, Any]]:
+def all_generators(env: Env) -> list[tuple[str, Any]]:
     """The generators that an environment may draw from besides `np_random`, or spaces, with their names."""
     everybodys: Any = (random.seed, np.random.get_state)
     names = ("the module random", "numpy.random")
     found = [(name, method.__self__) for name, method in zip(names, everybodys, strict=True)]
     for layer in layers_of(env):
         held = [(f"{_ITS} {name}", each) for name, each in held_by(layer) if name != "_np_random"]
-        for holder in holders_of(type(layer).__mro__):
-            held += [(f"{name} of {holder.__name__}", each) for name, each in vars(holder).items()]
+        held += generators_of(holders_of(type(layer).__mro__))
         found += [(name, each) for name, each in held if type(each) in GENERATORS]
         for name in ("action_space", "observation_space"):
             found += [(f"{name}.sample()", each) for each in spaces_in([getattr(layer, name, None)])]
@@ -303,8 +303,8 @@ def generators_of(env: Env) -> list[tuple[str, Any]]:
 
 
 def seed_all(env: Env, seed: int, other: str = "") -> list[tuple[str, Any]]:
-    """Seed all of `generators_of`, `other` with another seed."""
-    found = generators_of(env)
+    """Seed `all_generators`, `other` with another seed."""
+    found = all_generators(env)
     for name, each in found:
         own = seed + (name == other)
         if isinstance(each, np.random.Generator):

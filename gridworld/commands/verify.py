@@ -19,7 +19,7 @@ from gridworld.base.user_input import limited
 from gridworld.commands import parser_of
 from gridworld.report.evidence import find_runs
 from gridworld.training.saved_run import SavedRun
-from gridworld.training.verify import Verified, check_file, proven
+from gridworld.training.verify import Verified, check_certificate_file, proven
 
 _NOT_PROVEN = 1  # the exit code
 
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str]) -> None:
     if options.out is not None:
         if len(folders) > 1:
             raise InputError(f"--out {options.out}: is for one run, and there are {len(folders)}")
-        check_file(options.out)
+        check_certificate_file(options.out)
     proofs, mistakes = list[tuple[Verified, bool]](), 0
     for folder in folders:
         try:

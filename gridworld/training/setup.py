@@ -112,21 +112,20 @@ def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:
         score, own = score_of_optimum(judge, float(gamma)), solved(mdp, float(gamma))
     except InputError:  # no finite optimum
         return None
+    if score.certified:
+        alike = own.q >= own.v[:, None] - SAME * own.scale[:, None]
+        if config.agent.algorithm == "value_iteration":  # of equals, it takes what comes nearer to the end
+            alike = own.optimal
+        rank = np.where(alike, np.maximum(judge.solution.q, np.finfo(np.float64).min), np.inf)
+        worst = judge.score(one_hot_policy(rank.argmin(axis=1), mdp.num_actions))
+        if worst.certified:
+            return None
+        mistake = f"wrong actions are worth as much as the right ones (a regret of {worst.regret:.2g})"
+    else:
+        mistake = f"its optimum has a regret of {score.regret:.2g} under evaluation.gamma={judged:g}"
+        mistake += ", too much for a certificate"
     key = config.agent.key("gamma")
-    mistake, right = f"{key.lstrip('+')}={gamma:g}: ", f"; use {key}={recommended_gamma(judge):g}"
-    if not score.certified:
-        mistake += f"its optimum has a regret of {score.regret:.2g} under evaluation.gamma={judged:g}"
-        return f"{mistake}, too much for a certificate{right}"
-    alike = own.q >= own.v[:, None] - SAME * own.scale[:, None]
-    if config.agent.algorithm == "value_iteration":  # of equals, it takes what comes nearer to the end
-        alike = own.optimal
-    rank = np.where(alike, np.maximum(judge.solution.q, np.finfo(np.float64).min), np.inf)
-    worst = judge.score(one_hot_policy(rank.argmin(axis=1), mdp.num_actions))
-    if worst.certified:
-        return None
-    return (
-        f"{mistake}wrong actions are worth as much as the right ones (a regret of {worst.regret:.2g}){right}"
-    )
+    return f"{key.lstrip('+')}={gamma:g}: {mistake}; use {key}={recommended_gamma(judge):g}"
 
 
 def recommended_gamma(judge: Evaluator) -> float:

@@ -75,12 +75,12 @@ class Verified:
         """Write the certificate as JSON, compressed if the name ends with .gz."""
         if not self.certificate:
             raise InputError(f"{path}: not written, since {self}")
-        check_file(path)
+        check_certificate_file(path)
         content = json.dumps(self.certificate).encode()
         write_bytes(path, gzip.compress(content, mtime=0) if path.name.endswith(".gz") else content)
 
 
-def check_file(path: Path) -> None:
+def check_certificate_file(path: Path) -> None:
     """Refuse a place where no certificate can be written, or where something else is than an older one."""
     try:
         os.fsencode(path)
@@ -116,7 +116,7 @@ def verify(run: Any, out: str | PathLike[str] | None = None, *, best: bool = Fal
     """
     place = None if out is None else as_path("verify: out", out)
     if place is not None:
-        check_file(place)
+        check_certificate_file(place)
     saved = getattr(run, "saved", None)
     if saved is None or best:
         saved = SavedRun(as_path("verify: run", getattr(run, "folder", run)), best=best)

@@ -145,9 +145,15 @@ def holders_of(kinds: Iterable[type]) -> list[Any]:
     ]
 
 
-def generators_of(holders: Iterable[Any]) -> list[Any]:
-    """The random generators that classes and modules hold by a name."""
-    return [value for each in holders for value in vars(each).values() if isinstance(value, GENERATORS)]
+def generators_of(holders: Iterable[Any]) -> list[tuple[str, Any]]:
+    """The random generators that classes and modules hold, with what they are called there."""
+    held = [(each, vars(each).items()) for each in holders]
+    return [
+        (f"{name} of {each.__name__}", value)
+        for each, items in held
+        for name, value in items
+        if isinstance(value, GENERATORS)
+    ]
 
 
 def shared_with(holders: Iterable[Any]) -> list[Any]:

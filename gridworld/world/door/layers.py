@@ -121,7 +121,7 @@ class Layers:
         self.counters: dict[tuple[int, str], Counter] = {}  # numbers that change, and that nothing has read
         self._compares_forms = False  # whether what a stand-in was made from counts in a copy
         # Those that cannot be replaced, with their states.
-        self._generators = [(each, state_of(each)) for each in generators_of(holders)]
+        self._generators = [(each, state_of(each)) for _, each in generators_of(holders)]
         self.is_adopting = False
         self.ordinary: set[Any] = set(_PLAIN)  # classes whose objects are copied, unless they are known
 

@@ -74,8 +74,8 @@ def of_world(search: Search) -> tuple[int | None, bool]:
     """The step limit of what a search found, and whether something else truncates too, by the state."""
     known = [each for each in (met(search), search.limit_met) if each is not None]
     cut = {state.depth + 1 for state, step in _steps(search) if step.truncated}
-    on = {state.depth + 1 for state, step in _steps(search) if not step.truncated}
     if cut:
+        on = {state.depth + 1 for state, step in _steps(search) if not step.truncated}
         is_timed = all(
             search.states[step.following].depth == state.depth + 1
             for state, step in _steps(search)

@@ -81,6 +81,7 @@ class Search:
         most_states: more are refused.
         most_seconds: what takes longer is refused.
         compares: whether shares found by rejection are compared with real draws.
+        keeps_copies: whether those of all states are kept, not only of some.
     """
 
     def __init__(
@@ -92,9 +93,10 @@ class Search:
         most_states: int = MOST_STATES,
         most_seconds: float = MOST_SECONDS,
         compares: bool = True,
+        keeps_copies: bool = False,
     ) -> None:
         self.where, self.env, self.ignore = where, env, tuple(ignore)
-        self._compares = compares
+        self._compares, self._kept = compares, 1 if keeps_copies else SAMPLED  # the copy of one in so many
         self._read = state or known.state_reader(env.unwrapped)
         actions = env.action_space
         if not isinstance(actions, spaces.Discrete) or actions.start != 0 or actions.n > MOST_ACTIONS:
@@ -209,7 +211,7 @@ class Search:
         budget = self.budget
         budget.begin()
         most_states = budget.most_states
-        first = self.layers.take()
+        self.first = first = self.layers.take()
         if unknown := [each for each in self.ignore if each not in self.layers.names()]:
             self.merged(functools.partial(self.reset_from, first))  # which may make it
             known_names = dict.fromkeys(self.layers.names())
@@ -218,7 +220,6 @@ class Search:
                 raise InputError(
                     f"env.ignore={list(self.ignore)}: {self.where.removeprefix('env.id=')} {has}"
                 )
-        self.first = first
         self.resets = Resets(self, first)
         self._waiting: list[State] = []
         self.open(each.following for each in self.resets.starts)
@@ -340,7 +341,7 @@ class Search:
                 self.resets.check(state.copy)
             else:
                 self.resets.check_first(state.copy)
-            if state.number % SAMPLED:
+            if state.number % self._kept:
                 self.budget.num_bytes -= len(state.copy)
                 state.copy = b""
         while self._waiting_ends:
@@ -348,8 +349,7 @@ class Search:
 
     def merged(self, run: Callable[[], Result]) -> list[Step]:
         """The outcomes of a reset or a step."""
-        found = self.branching.outcomes(run)
-        return [Step(probability, *result) for result, probability in found.items()]
+        return [Step(probability, *result) for result, probability in self.branching.outcomes(run).items()]
 
     # ---- states ----
 
