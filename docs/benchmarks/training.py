@@ -81,7 +81,7 @@ def comparisons(workload: Workload) -> Iterator[Comparison]:
             None if peers.why_not("SBX") else partial(peers.sbx, name, num_envs),
             peers.why_not("SBX"),
         )
-    for agent in ("a2c", *(("qrdqn", "trpo") if importlib.util.find_spec("sb3_contrib") else ())):
+    for agent in ("a2c", *(("qrdqn",) if importlib.util.find_spec("sb3_contrib") else ())):
         yield Comparison(
             _TABLE,
             f"{agent}, shipped settings",

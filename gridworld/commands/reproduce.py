@@ -2,8 +2,8 @@
 
 It prints what has changed since then: commit and uncommitted changes, versions, processor, environment
 variables. Then it trains again in a temporary folder and compares the learning curve, final weights, visits,
-summary and TensorBoard points. A lengthened run is lengthened again; a run whose numbers depend on other runs
-of its sweep is trained together with them. Repeated after a kill, a command with --keep continues its run.
+summary and TensorBoard points. A lengthened run is lengthened again. Repeated after a kill, a command with
+--keep continues its run.
 Exit code: 0 if everything is identical, 1 if not, 2 if undecided.
 """
 
@@ -23,7 +23,7 @@ from gridworld.commands import parser_of
 from gridworld.run.folder import check_inside, claimed
 from gridworld.run.provenance import describe, differences, source_differences
 from gridworld.run.reader import RunReader, check_free, find_run, open_run, read_run, stored_world
-from gridworld.training.reproduce import check_whole, compare, lengths, population, repeat
+from gridworld.training.reproduce import check_whole, compare, lengths, repeat
 from gridworld.training.saved_run import settings_of
 from gridworld.training.setup import without_pictures
 
@@ -40,7 +40,6 @@ def main(arguments: Sequence[str]) -> None:
     with telling_if_slow(f"reading {options.run}"):
         check_whole(then, config)  # training may take hours
     *shorter, _ = lengths(then, config)
-    members = population(then)
     if options.keep is not None:
         check_inside(options.keep, "--keep")
         kept = find_run(options.keep)  # begun before the run had ended, it is the run itself or a copy
@@ -52,9 +51,6 @@ def main(arguments: Sequence[str]) -> None:
     if shorter:
         steps = ", ".join(f"{length:,}" for length in shorter)
         print(f"  made longer: to {steps} steps first, then on to {config.total_timesteps:,}", flush=True)
-    if members:
-        names = ", ".join(run.folder.name for run in members)
-        print(f"  its numbers depend on all runs of its population, which train again: {names}", flush=True)
     with (
         tempfile.TemporaryDirectory(prefix="gridworld-") as temporary,
         claimed(folder := options.keep or Path(temporary) / "again"),
@@ -63,7 +59,7 @@ def main(arguments: Sequence[str]) -> None:
             print(printable(f"  continues the run in {folder}, which had finished"))
         again = config if options.keep is not None else without_pictures(config)
         try:
-            repeat(then, folder, again, mdp, options.trust, members)
+            repeat(then, folder, again, mdp, options.trust)
         except InputError as error:
             now = find_run(folder)
             if now is None or (before and now.manifest == before.manifest):  # nothing was trained

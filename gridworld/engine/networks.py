@@ -7,10 +7,9 @@ in the same order. Rows begin at multiples of 64 bytes, as tensors of their own 
 
 from __future__ import annotations
 
-import copy
 import hashlib
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, Self, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -212,34 +211,6 @@ class DenseNetworks(_Rows):
                 if number:
                     slope = _BACKWARD[self._activation](torch.bmm(slope, weight), inputs)
 
-    def push(self, changes: Tensor) -> tuple[Array, ...]:
-        """How the outputs of the last run change, to first order, with changes (P, W) of the weights."""
-        of_nets = zip(self._nets, self._passes, self._by_layer(changes), strict=True)
-        return tuple(self._push(*of_net).cpu().numpy() for of_net in of_nets)
-
-    def _push(
-        self,
-        net: list[tuple[Tensor, Tensor]],
-        passed: list[Tensor | None],
-        changes: list[tuple[Tensor, Tensor]],
-    ) -> Tensor:
-        moved: Tensor | None = None  # the change of the layer's inputs
-        for number, ((weight, _), (of_weight, of_bias)) in enumerate(zip(net, changes, strict=True)):
-            inputs = passed[number]
-            if inputs is None:
-                columns = of_weight.transpose(1, 2)
-                outputs = columns if self._states is None else columns[:, self._states]
-            else:
-                outputs = torch.bmm(inputs, of_weight.transpose(1, 2))
-            outputs = outputs + of_bias[:, None]
-            if moved is not None:
-                outputs = outputs + torch.bmm(moved, weight.transpose(1, 2))
-            if number + 1 < len(net):
-                outputs = _BACKWARD[self._activation](outputs, passed[number + 1])
-            moved = outputs
-        assert moved is not None
-        return moved
-
 
 class ModuleNetworks(_Rows):
     """Any network of one run, differentiated by torch; its parameters become views of its row of weights."""
@@ -253,10 +224,9 @@ class ModuleNetworks(_Rows):
             parameter.data, parameter.grad = data, grad
         self._forward, self._parameters = network.forward, parameters
         self._outputs: tuple[Tensor, ...] = ()
-        self._pulled: list[tuple[Tensor, Sequence[Tensor]]] = []  # of each output, slopes and gradients
 
     def run(self, states: IntArray | None = None) -> tuple[Array, ...]:
-        self._outputs, self._pulled = (), []
+        self._outputs = ()
         with torch.enable_grad():
             self._outputs = self._forward(states)
         return tuple(output.detach().cpu().numpy()[None] for output in self._outputs)
@@ -271,20 +241,6 @@ class ModuleNetworks(_Rows):
             for slope, output in zip(slopes, self._outputs, strict=True)
         ]
         torch.autograd.backward(self._outputs, given, retain_graph=True, inputs=self._parameters)
-
-    def push(self, changes: Tensor) -> tuple[Array, ...]:
-        """See `DenseNetworks.push`: a pass back through the pass back, which is linear in the slopes."""
-        self._pulled = self._pulled or [self._pull(output) for output in self._outputs]
-        given = cut(changes[0], [each.shape for each in self._parameters])
-        moved = [
-            torch.autograd.grad(pulled, slopes, given, retain_graph=True)[0]
-            for slopes, pulled in self._pulled
-        ]
-        return tuple(each.cpu().numpy()[None] for each in moved)
-
-    def _pull(self, output: Tensor) -> tuple[Tensor, Sequence[Tensor]]:
-        slopes = torch.zeros_like(output, requires_grad=True)
-        return slopes, torch.autograd.grad(output, self._parameters, slopes, create_graph=True)
 
 
 Networks = DenseNetworks | ModuleNetworks
@@ -316,7 +272,7 @@ class StateNetwork:
         extract: Callable[[Tensor], Any],
     ) -> None:
         self.layers, self.parameters = layers, parameters
-        self._policy, self._observation, self._outputs = policy, observation, slice(None)
+        self._policy, self._observation = policy, observation
         self._extractors, self._extract = extractors, extract
         kinds = {_kind(each) for each in extractors}
         kind = kinds.pop() if len(kinds) == 1 else "any"
@@ -325,12 +281,6 @@ class StateNetwork:
         self._is_fixed = kind in ("flat", "fixed")
         self._is_learned = kind == "patches"
         self._all: Any = None  # of all states, the features if these never change, else the observations
-
-    def part(self, outputs: slice, parameters: Sequence[nn.Parameter]) -> Self:
-        """The part of it that makes some of its outputs with these parameters."""
-        part = copy.copy(self)
-        part.layers, part.parameters, part._outputs = self.layers[outputs], parameters, outputs
-        return part
 
     def vector(self) -> Tensor:
         """(W,), its weights as they are in SB3's model."""
@@ -357,7 +307,7 @@ class StateNetwork:
         if self.is_look_up:
             return tuple(_look_up(*net, states=states) for net in self.layers)
         features = self._features(states)
-        given = features[self._outputs] if isinstance(features, tuple) else (features,) * len(self.layers)
+        given = features if isinstance(features, tuple) else (features,) * len(self.layers)
         return tuple(_run(net, each) for net, each in zip(self.layers, given, strict=True))
 
     def _features(self, states: IntArray | None) -> Any:

@@ -1,4 +1,4 @@
-"""What PPO, A2C and TRPO share: rollouts by look-ups, generalised advantages, and losses by state and action.
+"""What PPO and A2C share: rollouts by look-ups, generalised advantages, and losses by state and action.
 
 A loss and its slopes at a network's outputs follow from sums per state and action, not sample by sample.
 

@@ -9,7 +9,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -201,8 +201,6 @@ class Population:
         num_timesteps: environment steps of each run.
     """
 
-    pushes: ClassVar[bool] = False  # whether it needs `Networks.push` of the networks that act
-
     def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
         self._runs = [weakref.ref(run) for run in runs]
         for row, run in enumerate(runs):
@@ -211,8 +209,7 @@ class Population:
         self.num_envs, self.num_states = first.envs.num_envs, mdp.num_states
         self.num_actions = mdp.num_actions
         self.active: BoolArray = np.ones(len(runs), dtype=np.bool_)
-        self.all_networks = self.networks_of(runs)
-        self.networks = self.all_networks[0]
+        self.networks = make_networks([run.network for run in runs], first.met)
         self.optimizer = self._optimizer()
         for run, state in zip(runs, states, strict=True):
             if state is not None:
@@ -237,11 +234,6 @@ class Population:
             *(repr(model.policy), str(model.device), run.reward_scale, run.network.digest()),
             *(model.num_timesteps, run.total_timesteps),
         )
-
-    @classmethod
-    def networks_of(cls, runs: Sequence[Run]) -> list[Networks]:
-        """The networks that runs learn with, as far as they differ in kind; the first acts."""
-        return [make_networks([run.network for run in runs], runs[0].met)]
 
     def _optimizer(self) -> Optimizer:
         own = [run.model.policy.optimizer for run in self.runs]
@@ -275,10 +267,6 @@ class Population:
         """Let a run take no further part."""
         self.active[run.row], run.has_ended = False, True
 
-    def fitted(self, run: Run) -> Sequence[Tensor]:
-        """The parameters of SB3's model that the optimiser steps on."""
-        return run.network.parameters
-
     def weights(self, run: Run) -> dict[str, tuple[Networks, Sequence[Tensor]]]:
         """The networks that a run has a row of, by their names in a state, and SB3's parameters for it."""
         return {"weights": (self.networks, run.network.parameters)}
@@ -299,10 +287,9 @@ class Population:
 
     def safe_point(self) -> Self | None:
         """Let all runs be saved, as nothing is half done; returns the population of those that go on."""
-        sums = [each.weights.sum(dim=1) for each in self.all_networks]  # a third of what asking each costs
-        finite = [torch.isfinite(each).cpu().numpy() for each in sums]
+        finite = torch.isfinite(self.networks.weights.sum(dim=1)).cpu()  # a third of what asking each costs
         for run in self.going():
-            if all(of_runs[run.row] for of_runs in finite):
+            if finite[run.row]:
                 run.safe_point(self.num_timesteps)
             else:
                 run.fail(diverged(run.model, "a weight"))
@@ -388,23 +375,17 @@ def agree(runs: Sequence[Run]) -> bool:
 
 
 def _try_out(runs: Sequence[Run]) -> bool:
-    generator, algorithm = np.random.default_rng(0), type(runs[0].population)
-    for number, together in enumerate(algorithm.networks_of(runs)):
-        outputs = [output.copy() for output in together.run()]
-        slopes = [generator.normal(size=output.shape) for output in outputs]
-        together.backward(*slopes)
-        pushes = algorithm.pushes and number == 0
-        moved = together.push(together.gradients) if pushes else ()
-        for row, run in enumerate(runs):
-            alone, own = algorithm.networks_of([run])[number], slice(row, row + 1)
-            found = list(alone.run())
-            alone.backward(*(slope[own] for slope in slopes))
-            found += alone.push(alone.gradients) if pushes else ()
-            if not all(
-                np.array_equal(*pair)
-                for pair in zip(found, (each[own] for each in (*outputs, *moved)), strict=True)
-            ):
-                return False
-            if not torch.equal(alone.gradients[0], together.gradients[row]):
-                return False
+    generator, met = np.random.default_rng(0), runs[0].met
+    together = make_networks([run.network for run in runs], met)
+    outputs = [output.copy() for output in together.run()]
+    slopes = [generator.normal(size=output.shape) for output in outputs]
+    together.backward(*slopes)
+    for row, run in enumerate(runs):
+        alone, own = make_networks([run.network], met), slice(row, row + 1)
+        same = all(
+            np.array_equal(found, output[own]) for found, output in zip(alone.run(), outputs, strict=True)
+        )
+        alone.backward(*(slope[own] for slope in slopes))
+        if not (same and torch.equal(alone.gradients[0], together.gradients[row])):
+            return False
     return True

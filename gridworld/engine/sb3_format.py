@@ -100,11 +100,11 @@ def put_weights(run: Run) -> None:
         parts = cut(networks.whole()[run.row], [parameter.shape for parameter in parameters])
         for parameter, part in zip(parameters, parts, strict=True):
             parameter.data.copy_(part)  # which may be a view of the row, and leaves a graph as it is
-    shapes = [parameter.shape for parameter in population.fitted(run)]
+    shapes = [parameter.shape for parameter in run.network.parameters]
     state = {name: torch.as_tensor(value) for name, value in population.optimizer.get_state(run.row).items()}
     spread = population.networks.spread
     cuts = {name: cut(spread(value), shapes) for name, value in state.items() if value.dim()}
-    for number, parameter in enumerate(population.fitted(run) if state else ()):
+    for number, parameter in enumerate(run.network.parameters if state else ()):
         optimizer.state[parameter] = {
             name: (cuts[name][number] if name in cuts else value).to(
                 parameter.device if name in cuts else "cpu"

@@ -2,8 +2,7 @@
 
 A run that was made longer is not the run of that length from the start: what is scheduled over training had
 come to its end already. So it is trained to its first length, and then resumed to each longer one. A run
-whose numbers depend on those of others, with which its networks were updated at once, is trained again
-together with these: its siblings in the sweep's folder, from their own manifests.
+whose last bits depend on the runs beside which it was trained, a population on CUDA, cannot be repeated.
 
 Compared are the learning curve, the model's tensors (the optimiser's too), the visit counts, the summary and
 TensorBoard's scalars, without the times in them. The runs' files are data, read within bounds.
@@ -13,8 +12,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -24,26 +22,15 @@ import numpy as np
 
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import LARGEST_CSV, as_table
-from gridworld.base.together import mixing
 from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
-from gridworld.run.folder import EVENTS, MANIFEST
-from gridworld.run.provenance import settings_hash
-from gridworld.run.reader import (
-    LARGEST_RESULT,
-    NUMBERS_DEPEND_ON,
-    RunReader,
-    find_run,
-    read_run,
-    stored_world,
-)
-from gridworld.run.summary import Summary
+from gridworld.run.folder import EVENTS
+from gridworld.run.reader import LARGEST_RESULT, NUMBERS_DEPEND_ON, RunReader, find_run
 from gridworld.training.resume import open_unfinished, unfinished_of
-from gridworld.training.saved_run import read_visits, settings_of
+from gridworld.training.saved_run import read_visits
 from gridworld.training.session import CLOCK
-from gridworld.training.setup import without_pictures
 from gridworld.training.tensorboard import read_scalars
-from gridworld.training.together import Training, run_alone, run_together
+from gridworld.training.together import run_alone
 from gridworld.training.train import training
 from gridworld.world.mdp import Mdp
 
@@ -55,6 +42,11 @@ Entries = Iterable[tuple[str, Any]]  # (where, value)
 
 def lengths(then: RunReader, config: TrainConfig) -> list[int]:
     """The lengths that a run had, in environment steps, one after the other; the last is the settings'."""
+    if any(each.get(NUMBERS_DEPEND_ON) for each in (then.manifest, *then.resumptions)):
+        raise InputError(
+            f"{then.folder}: was trained on CUDA at once with other runs, on which its last bits depend, "
+            "so it cannot be repeated; with hydra.sweeper.population=1 each run of a sweep trains alone"
+        )
     found = []
     for again in then.resumptions:
         if not again.get("total_timesteps"):
@@ -77,53 +69,8 @@ def lengths(then: RunReader, config: TrainConfig) -> list[int]:
     return found
 
 
-def population(then: RunReader) -> list[RunReader]:
-    """The runs that a run's numbers depend on, itself among them, in the order in which they were begun.
-
-    None where the run's numbers are those that it has alone.
-    """
-    depends_on = then.manifest.get(NUMBERS_DEPEND_ON, {})
-    if then.resumptions and any(NUMBERS_DEPEND_ON in each for each in (then.manifest, *then.resumptions)):
-        again = then.resumptions[-1]
-        how = "together with others" if NUMBERS_DEPEND_ON in again else "alone"
-        raise InputError(
-            f"{then.folder}: its numbers depend on other runs, and it was resumed {how} after step "
-            f"{again.get('step')}, which cannot be repeated"
-        )
-    folder = then.folder.resolve()
-    if depends_on and folder.name not in depends_on:
-        raise InputError(
-            f"{then.folder}: its numbers depend on the {len(depends_on)} runs that its manifest names, "
-            "itself included, but its folder was renamed; give it back its name, next to the others"
-        )
-    return [_member(then, folder.parent / name, digest) for name, digest in depends_on.items()]
-
-
-def _member(then: RunReader, folder: Path, digest: str) -> RunReader:
-    """One of the runs that `then` depends on, if it is still what it was then."""
-    why = f"{then.folder}: its numbers depend on the run {folder.name}, which"
-    if not (folder / MANIFEST).exists():
-        raise InputError(f"{why} is no longer in {folder.parent}; put its folder back")
-    run = read_run(folder)
-    longer = [again for again in run.resumptions if again.get("total_timesteps")]
-    first = longer[0].get("instead_of") if longer else run.manifest["config"].get("total_timesteps")
-    settings = run.manifest["config"] | {"total_timesteps": first}
-    if settings_hash(settings, "\n".join(run.manifest["layout"])) != digest:
-        raise InputError(f"{why} has different settings now; put back the run that was trained with it")
-    if any(str(again.get("at")) < str(then.manifest.get("ended")) for again in run.resumptions):
-        raise InputError(f"{why} has since been resumed from a checkpoint, which cannot be repeated")
-    return run
-
-
-def repeat(
-    then: RunReader,
-    folder: Path,
-    config: TrainConfig,
-    mdp: Mdp,
-    trust: bool = False,
-    members: Sequence[RunReader] = (),
-) -> None:
-    """Train a run again in `folder`, which exists, with the members of its `population` elsewhere.
+def repeat(then: RunReader, folder: Path, config: TrainConfig, mdp: Mdp, trust: bool = False) -> None:
+    """Train a run again in `folder`, which exists.
 
     A run of the same settings in it is continued as far as it lacks something. `trust` imports the classes
     that its settings name, wherever they are from. It is an `InputError` if it cannot be trained here.
@@ -134,11 +81,6 @@ def repeat(
     config = dataclasses.replace(config, total_timesteps=first, logging=logging)
     own = training(config, folder, overrides, lambda env: mdp, is_trusted=False)
     if begun := find_run(folder):
-        if members and not begun.is_finished:
-            raise InputError(
-                f"{folder}: contains an unfinished run, whose numbers depend on other runs, so it cannot be "
-                "continued; choose another folder"
-            )
         reached = begun.manifest["config"].get("total_timesteps")
         if reached in longer:
             first, longer = reached, longer[longer.index(reached) + 1 :]
@@ -146,34 +88,10 @@ def repeat(
         unfinished = unfinished_of(folder, same, lambda env: mdp, trust)
         if not begun.is_finished:
             unfinished.resume()
-    elif not members:
-        run_alone(own)
     else:
-        place = [run.folder.name for run in members].index(then.folder.resolve().name)
-        with tempfile.TemporaryDirectory(prefix="gridworld-") as others:
-            trainings = [_again(run, Path(others), config, trust) for run in members]
-            trainings[place] = own
-            with mixing(then.manifest[NUMBERS_DEPEND_ON]):
-                result = run_together(trainings)[place]
-        if isinstance(result, Exception):
-            raise result
+        run_alone(own)
     for length in longer:
         open_unfinished(folder, trust).resume(length)
-
-
-def _again(run: RunReader, place: Path, like: TrainConfig, trust: bool) -> Training[Summary]:
-    """A run again, in a folder of its own, on the machine's part that another is trained on."""
-    settings = without_pictures(settings_of(run, trust))
-    config = dataclasses.replace(
-        settings,
-        total_timesteps=lengths(run, settings)[0],
-        logging=dataclasses.replace(settings.logging, wandb=False),
-        device=like.device,
-        threads=like.threads,
-    )
-    mdp, folder = stored_world(run, config.env), place / run.folder.name
-    folder.mkdir()
-    return training(config, folder, [], lambda env: mdp, is_trusted=False)
 
 
 @dataclass(frozen=True)

@@ -35,10 +35,6 @@ SMALL: dict[str, Words] = {
         "agent.n_epochs=3",
     ),
     "a2c": ("agent=a2c", "total_timesteps=100", "n_envs=4"),
-    "trpo": (
-        *("agent=trpo", "total_timesteps=128", "n_envs=4", "agent.arguments.n_steps=8"),
-        *("agent.arguments.batch_size=8", "+agent.arguments.n_critic_updates=2"),
-    ),
 }
 
 
@@ -135,11 +131,6 @@ DIFFERENT: dict[str, list[tuple[str, ...]]] = {
         ("max_grad_norm=0.01", "max_grad_norm=1000", "learning_rate=sqrt_0.01"),
     ],
     "a2c": [*OF_POLICY, ("ent_coef=0.3", "vf_coef=2", ""), ("max_grad_norm=0.01", "", "gae_lambda=0")],
-    "trpo": [
-        *OF_POLICY,
-        ("target_kl=0.5", "target_kl=1e-5", ""),
-        ("line_search_shrinking_factor=0.3", "line_search_shrinking_factor=0.99", ""),
-    ],
 }
 
 
@@ -147,7 +138,7 @@ def word(agent: str, setting: str, inside: str = "") -> Words:
     """A word of the command line that gives the agent an argument."""
     if not setting:
         return ()
-    of_class = agent in ("qrdqn", "a2c", "trpo")
+    of_class = agent in ("qrdqn", "a2c")
     return (f"++agent.{'arguments.' if of_class else ''}{inside}{setting}",)
 
 
@@ -194,7 +185,6 @@ def test_runs_of_other_worlds_or_branches_train_as_alone(agent: str) -> None:
     assert_as_alone([(*SMALL[agent], each, "seed=3") for each in ["env.slip=0", *APART[agent]]])
 
 
-SHORT_SEARCH = ("line_search_max_iter=2", "cg_max_steps=3", "cg_damping=1e-4", "target_kl=1")
 ONE_SAMPLE = ("agent.batch_size=1", "total_timesteps=24", "agent.normalize_advantage=false")
 KWARGS, LATER = "agent.policy_kwargs", "agent.arguments"
 WRITTEN: dict[str, tuple[str, Words]] = {
@@ -208,8 +198,6 @@ WRITTEN: dict[str, tuple[str, Words]] = {
     "a2c one step": ("a2c", (f"{LATER}.n_steps=1", "total_timesteps=24")),
     "a2c scaled": ("a2c", (f"++{LATER}.normalize_advantage=true", "observation=coordinates")),
     "a2c adam": ("a2c", (f"++{LATER}.use_rms_prop=false",)),
-    "trpo parts": ("trpo", (f"+{LATER}.sub_sampling_factor=3", f"+{LATER}.normalize_advantage=false")),
-    "trpo short searches": ("trpo", tuple(f"++{LATER}.{each}" for each in SHORT_SEARCH)),
     "dqn one sample": ("dqn", ("agent.batch_size=1", "agent.gradient_steps=1", "agent.train_freq=1")),
     "dqn many steps": ("dqn", ("agent.gradient_steps=-1", "n_envs=3", "observation=coordinates")),
     "dqn episodes": ("dqn", ("agent.train_freq=[2,episode]", "n_envs=1")),
@@ -234,7 +222,7 @@ def test_buffers_batches_networks_and_optimisers_of_other_kinds(name: str, meeti
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("agent", SMALL)
 def test_one_that_diverges_fails_or_is_stopped_leaves_the_others_alone(agent: str) -> None:
-    tight = word(agent, "max_grad_norm=0.01" if agent != "trpo" else "")  # gradients are clipped, too
+    tight = word(agent, "max_grad_norm=0.01")  # gradients are clipped, too
     wild = (*SMALL[agent], *tight, "seed=1", *word(agent, "learning_rate=1e38"))
     runs = [(*SMALL[agent], *tight, f"seed={seed}") for seed in range(3)]
 

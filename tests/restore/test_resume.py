@@ -73,7 +73,7 @@ CASES = {
         *(*SHORT["dqn"], "agent.engine=stock", "agent.learning_rate=sqrt_0.01", "n_envs=8"),
         *("agent.gradient_steps=1", "total_timesteps=800"),
     ],
-    **{f"{name} stock": [*SHORT[name], "agent.engine=stock"] for name in ("a2c", "qrdqn", "trpo")},
+    **{f"{name} stock": [*SHORT[name], "agent.engine=stock"] for name in ("a2c", "qrdqn")},
     **{name: SHORT[name] for name in ("a2c", "qrdqn", "trpo", "q_learning", "sarsa", "expected_sarsa")},
 }
 LESS = ["recording.frames=false", "recording.gif=false", "env.slip=0.1", "exploration_bonus=0.1"]

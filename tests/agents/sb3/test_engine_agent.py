@@ -11,7 +11,7 @@ import pytest
 import torch
 from helpers.own_class import importable
 from helpers.support import SHORT, configure
-from sb3_contrib import QRDQN, TRPO
+from sb3_contrib import QRDQN
 from stable_baselines3 import A2C, DQN, PPO
 
 import gridworld
@@ -27,7 +27,7 @@ def built(*words: str, log: Any = None) -> Agent:
     return config.agent.build(make_context(config, config.env.compile(), log))
 
 
-SB3S = {"dqn": DQN, "ppo": PPO, "a2c": A2C, "qrdqn": QRDQN, "trpo": TRPO}
+SB3S = {"dqn": DQN, "ppo": PPO, "a2c": A2C, "qrdqn": QRDQN}
 
 
 @pytest.mark.parametrize("agent", SB3S)
@@ -118,7 +118,7 @@ def test_what_it_knows(words: list[str]) -> None:
     assert type(built(*words)) is EngineAgent
 
 
-@pytest.mark.parametrize("agent", ["a2c", "qrdqn", "trpo"])
+@pytest.mark.parametrize("agent", ["a2c", "qrdqn"])
 def test_a_class_with_its_arguments(agent: str, capsys: pytest.CaptureFixture[str]) -> None:
     without = [f"~agent.arguments.{name}" for name in vars(configure(f"agent={agent}").agent)["arguments"]]
     assert type(built(f"agent={agent}")) is EngineAgent
