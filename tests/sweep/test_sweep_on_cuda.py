@@ -72,9 +72,7 @@ def test_a_run_that_was_trained_at_once_with_others_is_not_repeated(sweeps: Path
     def reproduce(run: Path) -> subprocess.CompletedProcess[str]:
         return script("reproduce.py", str(run), cwd=sweeps, PYTHONPATH=str(ROOT / "tests"))
 
-    sentence = (
-        "was trained on CUDA at once with other runs, on which its last bits depend"
-    )
+    sentence = "was trained on CUDA at once with other runs, on which its last bits depend"
     shutil.copytree(sweeps / "alone" / "seed=1", tmp_path / "later")
     again = {"at": "9", "step": 512, "command": [], "numbers_depend_on": {"seed=2": "0"}}
     manifest(tmp_path / "later", lambda content: content.update(resumed=[again]))
