@@ -17,7 +17,6 @@ class SweepConfig:
 
     _target_: str = "hydra_plugins.gridworld_sweeper.GridWorldSweeper"
     retry_failed: bool = False  # run again what failed
-    stop_at_first_failure: bool = False  # leave the others for later
     extend: bool = False  # use the folder of a sweep that shares no job with this one
     max_jobs: int = 10_000  # more are refused as a mistake
     params: dict[str, Any] = field(default_factory=dict)  # settings and their values, as on a command line

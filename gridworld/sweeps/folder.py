@@ -44,7 +44,6 @@ from gridworld.run.reader import RunReader, check_is, find_run
 from gridworld.sweeps.plan import Job
 
 JOBS_CSV = "jobs.csv"
-STOP = ".stop"  # in the sweep's folder: no more jobs begin, wherever they wait
 STATUSES = ("pending", "running", "done", "failed", "interrupted")
 PENDING, RUNNING, DONE, FAILED, INTERRUPTED = STATUSES
 _OF_A_RUN = {"finished": DONE, "failed": FAILED}  # by the manifest's status; any other was interrupted
@@ -115,7 +114,6 @@ class SweepFolder:
         except OSError as error:
             raise InputError(f"{self.path}: cannot be made ({error.strerror})") from None
         with alone_in(self.path, wait=1):
-            (self.path / STOP).unlink(missing_ok=True)
             yield
 
     def add(self, jobs: Sequence[Job], words: Sequence[str]) -> list[JobEntry]:

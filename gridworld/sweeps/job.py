@@ -12,13 +12,12 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import yaml
-from hydra.core.utils import JobReturn, JobStatus, configure_log
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.utils import configure_log
+from omegaconf import DictConfig
 
-from gridworld.base.atomic_write import locked, write_bytes, write_text
+from gridworld.base.atomic_write import locked, write_text
 from gridworld.base.console import prepare
 from gridworld.base.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.base.signals import Interrupted, exiting, handling, send_sigterm
@@ -28,7 +27,7 @@ from gridworld.config.train import AUTO, TrainConfig
 from gridworld.run.folder import ERROR_FILE, LOCK, MANIFEST
 from gridworld.run.reader import find_run, is_started
 from gridworld.run.writer import clear, record_failure
-from gridworld.sweeps.folder import STOP, one_line
+from gridworld.sweeps.folder import one_line
 from gridworld.sweeps.plan import Job
 from gridworld.training.resume import unfinished_of
 from gridworld.training.together import Training, run_together
@@ -42,12 +41,8 @@ class JobError(Exception):
     """The job failed, or could not go on; its folder says which."""
 
 
-class StopSweep(BaseException):
-    """The job failed, and the sweep is to stop. Not an `Exception`: after one, others continue."""
-
-
 def run_in_sweep(
-    config: TrainConfig, folder: Path, overrides: list[str], stop_at_failure: bool, replaces: bool = False
+    config: TrainConfig, folder: Path, overrides: list[str], replaces: bool = False
 ) -> Training[float]:
     """Train in the job's folder, unless that is done or another process does it.
 
@@ -75,8 +70,6 @@ def run_in_sweep(
         why = one_line(reason(error))
         with contextlib.suppress(OSError):
             mark_failed(folder, why, "" if isinstance(error, InputError) else traceback.format_exc())
-        if stop_at_failure:
-            raise StopSweep(why) from None
         raise JobError(why) from None
 
 
@@ -107,7 +100,6 @@ class Worker:
     sweep: Path  # its folder
     where: str  # the folder that the command was typed in
     master: DictConfig  # the configuration of the sweep itself
-    callbacks: Any  # Hydra's, if some are the user's
 
     def __call__(self, jobs: Sequence[Job]) -> list[str]:
         """Run the jobs of a population; returns the error of each, or ""."""
@@ -129,42 +121,18 @@ class Worker:
         try:
             with exiting(signal.SIGTERM), handling(warning), contextlib.chdir(self.where):
                 for jobs in groups:
-                    if (self.sweep / STOP).exists():
-                        break
                     errors += self(jobs)
-        except StopSweep:
-            write_bytes(self.sweep / STOP, b"")  # for those that wait in a queue
         except (SystemExit, KeyboardInterrupt):
             pass
         return errors
 
     def _run(self, job: Job) -> Training[float]:
-        hydra, overrides = self.master.hydra, list(job.overrides)
+        subfolder = self.master.hydra.output_subdir
         job.folder.mkdir(parents=True, exist_ok=True)
-        if hydra.output_subdir is not None:
-            _save(job, job.folder / hydra.output_subdir)
-        own_folder = contextlib.chdir(job.folder) if hydra.job.chdir else contextlib.nullcontext()
-        with called_from(Path(self.where)), own_folder:
-            stops = hydra.sweeper.stop_at_first_failure
-            run = run_in_sweep(job.config, job.folder, overrides, stops, job.replaces)
-            return (yield from run if self.callbacks is None else self._between_callbacks(job, run))
-
-    def _between_callbacks(self, job: Job, run: Training[float]) -> Training[float]:
-        overrides, hydra = list(job.overrides), OmegaConf.to_container(self.master.hydra, resolve=False)
-        whole = OmegaConf.create(dataclasses.asdict(job.config) | {"hydra": hydra})
-        whole.hydra.runtime.output_dir, whole.hydra.job.num = str(job.folder), job.number
-        whole.hydra.overrides.task = overrides
-        self.callbacks.on_job_start(config=whole, task_function=None)
-        done = JobReturn(overrides=overrides, status=JobStatus.FAILED)
-        try:
-            done.return_value = yield from run
-            done.status = JobStatus.COMPLETED
-            return float(done.return_value)
-        except Exception as error:
-            done.return_value = error
-            raise
-        finally:
-            self.callbacks.on_job_end(config=whole, job_return=done)
+        if subfolder is not None:
+            _save(job, job.folder / subfolder)
+        with called_from(Path(self.where)):
+            return (yield from run_in_sweep(job.config, job.folder, list(job.overrides), job.replaces))
 
 
 def _save(job: Job, folder: Path) -> None:

@@ -62,7 +62,6 @@ class Job:
     notes: tuple[str, ...] = ()  # what to say before training
     # Once it is to run:
     folder: Path = Path()
-    number: int = 0  # among those of this start of the sweep
     replaces: bool = False  # a finished run in the folder, which is not the job's result
 
     @property

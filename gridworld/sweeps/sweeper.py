@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import itertools
 import os
 import signal
 import time
@@ -26,7 +25,7 @@ from gridworld.config.words import prepared
 from gridworld.run.folder import ERROR_FILE, shell_path
 from gridworld.sweeps import console
 from gridworld.sweeps.folder import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, JobRow, SweepFolder
-from gridworld.sweeps.job import StopSweep, Worker, mark_failed, run_status
+from gridworld.sweeps.job import Worker, mark_failed, run_status
 from gridworld.sweeps.launchers import Group, Launch, launcher_settings, run_groups
 from gridworld.sweeps.plan import Configurations, Job, expand, largest_population, plan, populations
 
@@ -34,7 +33,6 @@ _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
 _POLL_SECONDS = 0.1
 _SECONDS_BETWEEN_LOOKS = 0.5
 _MOST_NOTES = 4  # that are printed before the jobs begin
-_OURS = 1  # of Hydra's callbacks
 _SHARE_OF_TIME = 30  # looking after the jobs takes at most one thirtieth of it
 
 
@@ -42,18 +40,15 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
     """Run the jobs that are asked for and not done yet."""
     folder = SweepFolder(Path(master.hydra.sweep.dir))
     launcher, own = launcher_settings(master)
-    callbacks = context.callbacks if len(master.hydra.callbacks) > _OURS else None
-    first_counts = settings.stop_at_first_failure
-    in_turn = first_counts or master.hydra.job.chdir  # jobs cannot train together
-    if (launcher == "forks" and (callbacks or in_turn)) or (launcher == "joblib" and first_counts):
-        launcher = "basic"
-    most = 1 if in_turn else largest_population(settings.population)
+    if master.hydra.job.chdir:
+        raise InputError("hydra.job.chdir=true: is for a single run; the jobs of a sweep train together")
+    most = largest_population(settings.population)
     divide = partial(populations, most=most, launcher=launcher, own=own)
     words = [*_of_yaml(settings), *words]  # a word of the command line comes later, and counts
     loader = context.config_loader
     jobs = plan(expand(words, loader, settings.max_jobs, settings.paired), Configurations(loader, master))
     mistaken = [job for job in jobs if job.mistake is not None]
-    if len(mistaken) == len(jobs) or (mistaken and settings.stop_at_first_failure):
+    if len(mistaken) == len(jobs):
         share = f" ({len(mistaken)} of {len(jobs)} jobs cannot run)" if len(jobs) > 1 else ""
         raise InputError(f"{mistaken[0].mistake}{share}")
     folder.check(jobs, settings.extend)
@@ -64,7 +59,7 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
             here = folder.path.absolute()
             with read_write(master.hydra.runtime), open_dict(master.hydra.runtime):
                 master.hydra.runtime.output_dir = str(here)  # for `hydra.job_logging`
-            worker = Worker(here, os.getcwd(), master, callbacks)
+            worker = Worker(here, os.getcwd(), master)
             sweep = _Sweep(folder, jobs, words, worker, partial(run_groups, launcher=launcher, own=own))
             code = sweep.run(divide, settings.retry_failed)
     except ConnectionError:
@@ -105,7 +100,6 @@ class _Sweep:
         self._reasons = {self._names[job.hash]: job.mistake for job in jobs if job.mistake}
         self._rows: dict[str, JobRow] = {}
         self._line = ProgressLine(any(job.config.logging.progress for job in jobs))
-        self._numbers = itertools.count()
         self._started = self._due = time.monotonic()
         self._ended_before = 0
 
@@ -127,8 +121,6 @@ class _Sweep:
             with exiting(signal.SIGINT, signal.SIGTERM, first=received.append):
                 if to_do and (lost := self._launch(divide(to_do))):
                     self._run_lost([job for job in to_do if job.hash in lost])
-        except StopSweep:
-            stopped = "stopped at the first failure"
         except SystemExit as end:
             code = 128 + received[0] if received else end.code if isinstance(end.code, int) else 1
             stopped = f"stopped by {signal_name(code - 128)}" if code > 128 else "stopped"
@@ -169,8 +161,7 @@ class _Sweep:
 
     def _begun(self, job: Job, folder: Path) -> Job:
         row = self._rows.pop(self._names[job.hash])
-        number, replaces = next(self._numbers), row.status == FAILED
-        return dataclasses.replace(job, folder=folder / row.job, number=number, replaces=replaces)
+        return dataclasses.replace(job, folder=folder / row.job, replaces=row.status == FAILED)
 
     def _row(self, job: Job) -> JobRow:
         return self._rows[self._names[job.hash]]

@@ -29,7 +29,7 @@ def stand_in(patch: Callable[[Any, str, Any], None] = setattr) -> None:
 
 
 class StandIn(Callback):
-    """Does so in the process of a sweep, in which all jobs run where there is a callback of the user's."""
+    """Does so in the process of a sweep, in which its jobs run with `hydra/launcher=basic`."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Called by Hydra before the sweep."""

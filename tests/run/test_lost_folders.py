@@ -56,7 +56,7 @@ def test_a_run_that_lost_its_folder_leaves_the_new_one_alone(
     folder.mkdir()
     if is_job:
         with SweepFolder(tmp_path).at_work(), pytest.raises(JobError, match=TOLD):
-            run_alone(run_in_sweep(configure(*WORDS), folder, WORDS, stop_at_failure=False))
+            run_alone(run_in_sweep(configure(*WORDS), folder, WORDS))
     else:
         with pytest.raises(FolderLostError, match=TOLD), alone_in(folder):
             begin(folder, *WORDS)

@@ -144,13 +144,9 @@ def test_a_failure_stops_no_other_job(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_what_fails_while_it_runs_is_told_and_tried_again_if_asked(tmp_path: Path) -> None:
     words = ("agent=dqn", "agent.learning_rate=1e30,1e-3", "total_timesteps=600", "agent.learning_starts=200")
     folder = tmp_path / "sweep"
-    first = sweep(*words, "hydra.sweeper.stop_at_first_failure=true", cwd=tmp_path)
-    assert first.returncode == 1
-    assert list(statuses(folder).values()) == ["failed", "pending"]
-    assert "stopped at the first failure; resume with: python " in first.stderr
     done = sweep(*words, cwd=tmp_path)
     assert done.returncode == 1, done.stderr
-    assert "1 to run" in done.stderr
+    assert sorted(statuses(folder).values()) == ["done", "failed"]
     (failed,) = (job for job, status in statuses(folder).items() if status == "failed")
     assert "training diverged" in table(folder)[failed]["error"]
     assert json.loads((folder / failed / "manifest.json").read_text())["status"] == "failed"

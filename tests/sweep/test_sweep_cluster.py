@@ -100,16 +100,6 @@ def test_a_signal_gives_its_tasks_up(cluster: Cluster, tmp_path: Path) -> None:
         assert cluster.slurms("squeue", "--noheader", "--states=PENDING,RUNNING") == ""
 
 
-def test_no_job_begins_after_the_first_failure_if_asked(cluster: Cluster, tmp_path: Path) -> None:
-    one_at_a_time = {"slurm": "hydra.launcher.array_parallelism=1", "ray": "hydra.launcher.remote.num_cpus=2"}
-    words = (*a_class("own.Broken"), "seed=0,1,2", one_at_a_time[cluster.launcher])
-    done = cluster.sweep(*words, "hydra.sweeper.stop_at_first_failure=true", cwd=tmp_path)
-    assert done.returncode == 1
-    assert "stopped at the first failure; resume with: python " in done.stderr
-    assert Counter(statuses(tmp_path / "sweep").values()) == {"failed": 1, "pending": 2}
-    assert list((tmp_path / "sweep").glob("*/manifest.json")) != []
-
-
 @pytest.mark.parametrize("cluster", ["slurm"], indirect=True)
 def test_slurms_warning_interrupts_a_job_and_a_restart_has_the_rest(cluster: Cluster, tmp_path: Path) -> None:
     folder = tmp_path / "sweep"

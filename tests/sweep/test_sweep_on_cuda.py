@@ -33,11 +33,9 @@ NAMES = ["seed=0", "seed=1", "seed=2"]
 
 def sweep(cwd: Path, name: str, *words: str) -> subprocess.CompletedProcess[str]:
     device = "+hydra.callbacks.device._target_=helpers.stand_in_cuda.StandIn"
-    return script(
-        *("train.py", "-m", *SMALL, "seed=range(3)", *words, f"hydra.sweep.dir={name}", device),
-        cwd=cwd,
-        PYTHONPATH=str(ROOT / "tests"),
-    )
+    here = (device, "hydra/launcher=basic", f"hydra.sweep.dir={name}")
+    path = str(ROOT / "tests")
+    return script("train.py", "-m", *SMALL, "seed=range(3)", *words, *here, cwd=cwd, PYTHONPATH=path)
 
 
 def manifest_of(run: Path) -> dict[str, Any]:

@@ -220,7 +220,7 @@ def conf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_yaml_says_what_is_swept_and_that_it_is_a_sweep(conf: Path, tmp_path: Path) -> None:
-    words = ["--config-dir", str(conf), "experiment=grid", "hydra.sweep.dir=sweep", "hydra.job.chdir=true"]
+    words = ["--config-dir", str(conf), "experiment=grid", "hydra.sweep.dir=sweep"]
     done = script("train.py", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     names = {path.parent.name for path in tmp_path.glob("sweep/*/summary.json")}

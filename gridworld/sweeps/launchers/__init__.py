@@ -20,8 +20,7 @@ from gridworld.base.processes import LostError, Processes, can_fork, worker_coun
 from gridworld.config.compose import refuse_unused
 from gridworld.config.sweep import LAUNCHER_SCHEMAS
 from gridworld.config.train import check_bounds
-from gridworld.sweeps.folder import STOP
-from gridworld.sweeps.job import StopSweep, Worker
+from gridworld.sweeps.job import Worker
 from gridworld.sweeps.plan import Job, runs_apart
 from gridworld.training.setup import import_for
 
@@ -69,7 +68,7 @@ def launcher_settings(config: DictConfig) -> tuple[str, dict[str, Any]]:
 
 
 def run_groups(launch: Launch, launcher: str, own: Mapping[str, Any]) -> None:
-    """Run populations. Raises `StopSweep`, `SystemExit`, or `InputError` where a cluster takes no jobs."""
+    """Run populations. Raises `SystemExit`, or `InputError` where a cluster takes no jobs."""
     if launcher in _NEEDS:
         import_module(f"gridworld.sweeps.launchers.{launcher}").run(launch, own)
         return
@@ -93,13 +92,11 @@ def collect(
     is_done: Callable[[Task], bool],
     result: Callable[[Task], list[str]],
 ) -> None:
-    """Wait until tasks on a cluster have ended. Raises `StopSweep`."""
+    """Wait until tasks on a cluster have ended."""
     left = dict(tasks)
     while left:
         launch.tick()
         time.sleep(_SECONDS_BETWEEN_TICKS)
-        if (launch.worker.sweep / STOP).exists():
-            raise StopSweep("a job failed")
         for task in [task for task in left if is_done(task)]:
             jobs = left.pop(task)
             try:

@@ -14,7 +14,7 @@ from ray.exceptions import RayError, TaskCancelledError
 from gridworld.base.errors import InputError
 from gridworld.base.processes import LostError
 from gridworld.base.signals import handling
-from gridworld.sweeps.job import StopSweep, Worker
+from gridworld.sweeps.job import Worker
 from gridworld.sweeps.launchers import Launch, collect
 from gridworld.sweeps.plan import Job
 
@@ -29,11 +29,6 @@ def run(launch: Launch, settings: Mapping[str, Any]) -> None:
     tasks = {function.remote(worker, list(jobs)): jobs for jobs in launch.groups}
     try:
         collect(launch, tasks, _is_done, _result)
-    except StopSweep:
-        # Tasks that wait see the file and end by themselves. Ray's own process is aborted where a task is
-        # cancelled in the moment in which it ends.
-        _cancel(_wait_for(list(tasks), _ENDED_WITHIN))
-        raise
     except BaseException:
         _cancel(_wait_for(list(tasks), 0))
         raise

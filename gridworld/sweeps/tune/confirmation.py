@@ -129,7 +129,7 @@ def run_held_out(runs: Sequence[HeldOutRun]) -> None:
 def _training(run: HeldOutRun) -> Training[None]:
     inside(run.folder.parents[1], CONFIRM, run.folder.name).mkdir(parents=True, exist_ok=True)
     try:
-        yield from run_in_sweep(run.config, run.folder, run.words, stop_at_failure=False)
+        yield from run_in_sweep(run.config, run.folder, run.words)
     except JobError as error:
         tell(f"{run.folder}: {error}")
 
