@@ -5,6 +5,7 @@ The page writes them as HTML.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 from collections import Counter
@@ -110,6 +111,20 @@ def to_markdown(table: Table) -> str:
     rows: list[Iterable[str]] = [map(_markdown, table.columns), sides]
     rows += [map(_markdown, row) for row in table.rows]
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def to_coloured_markdown(table: Table) -> str:
+    """A table of shares of which each begins with a square: green for all, yellow for some, red for none."""
+
+    def coloured(cell: Cell) -> Cell:
+        if not isinstance(cell, Share):
+            return "" if cell is None else cell
+        square = "\N{LARGE GREEN SQUARE}" if cell.is_whole else "\N{LARGE RED SQUARE}"
+        if 0 < cell.count < cell.total:
+            square = "\N{LARGE YELLOW SQUARE}"
+        return f"{square} {texts(cell)[0]}"
+
+    return to_markdown(dataclasses.replace(table, rows=[list(map(coloured, row)) for row in table.rows]))
 
 
 def _markdown(cell: Cell) -> str:

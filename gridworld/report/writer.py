@@ -29,7 +29,7 @@ from gridworld.config.train import PICTURES
 from gridworld.report import statistics, tables
 from gridworld.report.analysis import MOST_SHOWN, Band, Report, Result, TaskAnalysis, gather
 from gridworld.report.playground.page import maps_page
-from gridworld.report.tables import to_captioned_markdown, to_csv, to_markdown
+from gridworld.report.tables import to_captioned_markdown, to_csv
 from gridworld.run.folder import EVENTS as EVENT_FILE
 from gridworld.run.folder import SUMMARY, check_writable
 from gridworld.training.learning_curve import GREEDY, GREEDY_MORE
@@ -278,10 +278,11 @@ def check_markers(path: Path) -> None:
 
 
 def write_readme(report: Report, path: Path) -> None:
-    """Put the table of results between the two markers of a Markdown file; see `check_markers`."""
+    """Put the tables of results between the two markers of a Markdown file; see `check_markers`."""
     before, after = _around_markers(path)
-    table = to_markdown(tables.results_table(report.tasks, report.reasons))
-    write_text(path, f"{before}{MARKERS[0]}\n{table}{MARKERS[1]}{after}")
+    certified = tables.to_coloured_markdown(tables.answer_table(report.study, report.tasks))
+    details = tables.to_markdown(tables.results_table(report.tasks, report.reasons))
+    write_text(path, f"{before}{MARKERS[0]}\n{certified}\n{details}{MARKERS[1]}{after}")
 
 
 def _around_markers(path: Path) -> tuple[str, str]:

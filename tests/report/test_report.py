@@ -661,7 +661,8 @@ def test_a_readmes_table_is_replaced(maker: Maker, tmp_path: Path) -> None:
     readme.write_text(f"before\n\n{MARKERS[0]}\nold\n{MARKERS[1]}\n\nafter\n")
     report_of(tmp_path / "runs", options=("--readme", str(readme)))
     once = readme.read_text()
-    assert once.startswith(f"before\n\n{MARKERS[0]}\n| task | agent | seeds certified |")
+    matrix = "| agent | classic |\n| --- | --- |\n| ppo | \N{LARGE GREEN SQUARE} 1 / 1 |\n"
+    assert once.startswith(f"before\n\n{MARKERS[0]}\n{matrix}\n| task | agent | seeds certified |")
     assert "\n| classic | ppo | 1 / 1 " in once
     assert once.endswith(f" |\n{MARKERS[1]}\n\nafter\n")
     report_of(tmp_path / "runs", options=("--readme", str(readme)))
