@@ -1,8 +1,9 @@
 """Peers in an environment of their own, since their dependencies conflict with ours.
 
-`NAVIX_PYTHON`, `SBX_PYTHON` and `RL_ZOO_PYTHON` name a Python that has NAVIX, SBX (SB3 in JAX) or RL Zoo
-(SB3's training scripts); docs/how-to/speed.md says how to make one. A peer without a Python is in the table
-as not measured.
+`NAVIX_PYTHON`, `SBX_PYTHON`, `RL_ZOO_PYTHON`, `ENVPOOL_PYTHON` and `MDPSOLVER_PYTHON` name a Python that has
+NAVIX, SBX (SB3 in JAX), RL Zoo (SB3's training scripts), EnvPool (environments in C++ threads) or mdpsolver
+(dynamic programming in C++); docs/how-to/speed.md says how to make one. A peer without a Python
+is in the table as not measured.
 """
 
 from __future__ import annotations
@@ -10,9 +11,13 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import tempfile
 from pathlib import Path
 
+import numpy as np
+
 from gridworld.base.errors import InputError
+from gridworld.world.mdp import Mdp
 
 # NAVIX's own PPO on Empty-5x5, compiled; the second of two runs is timed, when nothing is left to compile.
 _NAVIX = """
@@ -56,11 +61,40 @@ model.learn(2048 * count, reset_num_timesteps=False)
 print((model.num_timesteps - before) / (time.perf_counter() - started))
 """
 
+_ENVPOOL = """
+import sys, time, envpool, numpy
+count, seconds = int(sys.argv[1]), float(sys.argv[2])
+envs = envpool.make_gymnasium("FrozenLake-v1", num_envs=count, num_threads=2)
+actions = numpy.random.default_rng(0).integers(4, size=(32, count), dtype=numpy.int32)
+envs.reset()
+steps, started = 0, time.perf_counter()
+while time.perf_counter() - started < seconds:
+    for batch in actions:
+        envs.step(batch)
+    steps += actions.size
+print(steps / (time.perf_counter() - started))
+"""
+
+# Only the solving is timed, not the copying of the tables into lists.
+_MDPSOLVER = """
+import sys, time, numpy, mdpsolver
+tables = numpy.load(sys.argv[1])
+probability, next_state = tables["probability"], tables["next_state"]
+rewards = (probability * tables["reward"]).sum(axis=2).tolist()
+model = mdpsolver.model()
+model.mdp(
+    discount=0.99, rewards=rewards, tranMatProbs=probability.tolist(), tranMatColumns=next_state.tolist()
+)
+started = time.perf_counter()
+model.solve(algorithm="mpi", tolerance=1e-9, verbose=False)
+print(time.perf_counter() - started)
+"""
+
 _RL_ZOO_SETTINGS = Path(__file__).with_name("rl_zoo.yml")
 
 
 def why_not(peer: str) -> str:
-    """Why a peer (NAVIX, SBX or RL_ZOO) is not measured; "" where it is."""
+    """Why a peer (NAVIX, SBX, RL_ZOO, ENVPOOL or MDPSOLVER) is not measured; "" where it is."""
     variable = _variable(peer)
     is_there = shutil.which(os.environ.get(variable, "")) is not None
     return "" if is_there else f"not measured, {variable} names no Python that has it"
@@ -74,6 +108,19 @@ def navix(seeds: int = 1) -> float:
 def sbx(algorithm: str, num_envs: int) -> float:
     """Environment steps a second of SBX's PPO or DQN."""
     return _run("SBX", _SBX, algorithm, str(num_envs))
+
+
+def envpool(num_envs: int, seconds: float) -> float:
+    """Environment steps a second of EnvPool's FrozenLake."""
+    return _run("ENVPOOL", _ENVPOOL, str(num_envs), str(seconds))
+
+
+def mdpsolver(mdp: Mdp) -> float:
+    """Seconds in which mdpsolver solves a world, to 1e-9."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "tables.npz"
+        np.savez(path, probability=mdp.probability, next_state=mdp.next_state, reward=mdp.reward)
+        return _run("MDPSOLVER", _MDPSOLVER, str(path))
 
 
 def rl_zoo(algorithm: str, steps: int) -> list[str]:

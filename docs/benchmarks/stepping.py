@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from benchmarks import peers
 from benchmarks.measure import Comparison, Workload
 
 from gridworld.envs.env import GridWorldEnv
@@ -19,7 +21,7 @@ _PEER = "Gymnasium's FrozenLake-v1"
 
 
 def comparisons(workload: Workload) -> Iterator[Comparison]:
-    """The single environment and batches, of states and of one-hot rows, compared with FrozenLake's."""
+    """The single environment and batches, of states and of one-hot rows, compared with FrozenLakes."""
     lake: Any = gym.make("FrozenLake-v1").unwrapped
     lakes = gym.vector.SyncVectorEnv([lambda: gym.make("FrozenLake-v1")] * 64)
 
@@ -45,6 +47,14 @@ def comparisons(workload: Workload) -> Iterator[Comparison]:
                 f"{_PEER}, SyncVectorEnv(64)",
                 theirs,
             )
+        yield Comparison(
+            _TABLE,
+            f"{size} environments, states",
+            ours(size, _as_it_is),
+            f"EnvPool's FrozenLake-v1, {size}, two threads",
+            None if peers.why_not("ENVPOOL") else partial(peers.envpool, size, workload.seconds),
+            peers.why_not("ENVPOOL"),
+        )
     yield Comparison(
         _TABLE,
         "1024 environments, states, 200x200",

@@ -1,4 +1,4 @@
-"""Gymnasium's own environments: compiling them, training there, and SB3 with and without our batch."""
+"""Solving, and Gymnasium's own environments: compiling, and training with SB3 with and without our batch."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 import torch
+from benchmarks import peers
 from benchmarks.measure import Comparison, Workload
 from benchmarks.training import DQN_BATCH, PPO_LARGE, STOCK, learner, sb3_learner
 from stable_baselines3 import DQN, PPO
@@ -16,9 +17,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env as dummy_vec_env
 
 from gridworld.config.worlds import GymnasiumConfig
+from gridworld.envs.vector_env import GridWorldVectorEnv
+from gridworld.world.solver import value_iteration
 
 WORLDS = ("FrozenLake-v1", "CliffWalking-v1", "Taxi-v4")
 ENVS = 1024
+SIDES = (100, 300)
 # Each transition is replayed 8 times, as by SB3's defaults. With 8 environments, rollouts are as large, and
 # as many transitions lie between two updates.
 DQN_LARGE = (*DQN_BATCH, f"n_envs={ENVS}", f"agent.batch_size={8 * ENVS}")
@@ -38,8 +42,18 @@ LEARNERS: tuple[tuple[type[BaseAlgorithm], tuple[str, ...], dict[str, Any]], ...
 
 
 def comparisons(workload: Workload) -> Iterator[Comparison]:
-    """Compiling each world, then PPO and DQN on each."""
+    """Solving slippery maps, compiling each world, then PPO and DQN on each."""
     torch.set_num_threads(1)
+    for side in SIDES:
+        mdp = GridWorldVectorEnv(1, num_rows=side, num_cols=side, slip=0.1).mdp
+        yield Comparison(
+            "solving, seconds",
+            f"{side}x{side} cells, slip 0.1",
+            partial(_seconds, partial(value_iteration, mdp, 0.99)),
+            "mdpsolver, modified policy iteration",
+            None if peers.why_not("MDPSOLVER") else partial(peers.mdpsolver, mdp),
+            peers.why_not("MDPSOLVER"),
+        )
     worlds = [GymnasiumConfig(id=name) for name in WORLDS]
     for world in worlds:
         yield Comparison(

@@ -36,7 +36,6 @@ COMMANDS = {
     "examine": "examine an environment: why nothing learns in it",
     "play": "play a world yourself, next to a trained agent if you like",
     "playground": "draw worlds and watch Q-learning at work, in the browser",
-    "benchmark": "measure the speed of this project and its peers",
 }
 _MANUAL = """\
 Train Stable-Baselines3 agents on worlds small enough to solve exactly, and know

@@ -12,12 +12,11 @@ from omegaconf import OmegaConf
 
 import gridworld
 from gridworld.base.errors import InputError
-from gridworld.commands import benchmark
 
 sys.path.append(str(ROOT / "docs"))
-measure, training, worlds, population, peers, whole = (
+benchmark, measure, training, worlds, population, peers, whole = (
     import_module(f"benchmarks.{name}")
-    for name in ("measure", "training", "worlds", "population", "peers", "end_to_end")
+    for name in ("benchmark", "measure", "training", "worlds", "population", "peers", "end_to_end")
 )
 
 
