@@ -67,6 +67,13 @@ def blas_threads() -> tuple[Callable[[], int], Callable[[int], Any]]:
     return _blas[0]
 
 
+def let_hydra_parse() -> None:
+    """Let Hydra 1.3 start with Python 3.14, whose argparse checks each help; one of Hydra's is not text until printed."""
+    import argparse
+
+    argparse.ArgumentParser._check_help = lambda self, action: None  # type: ignore[attr-defined]
+
+
 def keep_compiler_out() -> None:
     """Spare a run of the engine the import of torch's compiler: 2 s of the 6 s that a short one then takes.
 

@@ -30,6 +30,7 @@ from gridworld.base.bounds import digits
 from gridworld.base.console import tell_error
 from gridworld.base.errors import EXIT_CODE, InputError
 from gridworld.base.user_input import called_from, limited
+from gridworld.base.workarounds import let_hydra_parse
 from gridworld.commands.manual import manual
 from gridworld.config.compose import VERSION_BASE, completed, refuse_unused, register_schemas, to_config
 from gridworld.config.messages import sentence
@@ -62,6 +63,7 @@ def main(words: Sequence[str]) -> None:
 def _call_hydra() -> None:
     """Have Hydra compose what `sys.argv` says, and call `run_job` or the sweeper with it."""
     register_schemas()
+    let_hydra_parse()
     asked_for_traceback = FULL_ERROR in os.environ
     os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors instead of printing them
     try:

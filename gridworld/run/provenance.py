@@ -32,8 +32,8 @@ from gridworld.run.folder import SOURCE_DIFF
 LARGEST_DIFF = 2**20  # bytes; of a larger one only the checksum is kept
 
 PACKAGES = (
-    *("gridworld", "gymnasium", "hydra-core", "numpy", "omegaconf", "pillow", "pygame", "sb3-contrib"),
-    *("scipy", "stable-baselines3", "tensorboard", "torch"),
+    *("gridworld", "gymnasium", "hydra-core", "numpy", "omegaconf", "pillow", "pygame", "pygame-ce"),
+    *("sb3-contrib", "scipy", "stable-baselines3", "tensorboard", "torch"),
 )
 # Read by Python, torch and the numerical libraries.
 _VARIABLES = (
