@@ -68,7 +68,7 @@ def blas_threads() -> tuple[Callable[[], int], Callable[[int], Any]]:
 
 
 def let_hydra_parse() -> None:
-    """Let Hydra 1.3 start with Python 3.14, whose argparse checks each help; one of Hydra's is not text until printed."""
+    """Let Hydra 1.3 start on Python 3.14, whose argparse refuses a help that is turned into text later."""
     import argparse
 
     argparse.ArgumentParser._check_help = lambda self, action: None  # type: ignore[attr-defined]

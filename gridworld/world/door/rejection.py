@@ -185,7 +185,7 @@ class Rejecting(Branching):
             frame = frame.f_back
         places, held = [], []
         while frame is not None and frame.f_code not in self._runs:
-            code, at, variables = frame.f_code, frame.f_lasti, frame.f_locals
+            code, at, variables = frame.f_code, frame.f_lasti, dict(frame.f_locals)
             around = _ranges_around(code, at) if _calls(code, at, name) else None
             if around is None or any(each not in variables for each in around):
                 return None
@@ -305,14 +305,20 @@ def _ranges_around(code: CodeType, at: int) -> tuple[str, ...] | None:
     names = []
     for place, loop in enumerate(found):
         if loop.opname == "FOR_ITER" and loop.offset <= at < loop.argval:
-            store = found[place + 1]
-            inside = [each for each in found if loop.offset < each.offset < loop.argval]
-            num_stores = sum(each.argval == store.argval and "STORE" in each.opname for each in inside)
+            sets = [_set_by(each) for each in found if loop.offset < each.offset < loop.argval]
             is_range = found[place - 1].opname == "GET_ITER" and _is_range(code, found[place - 2].offset)
-            if not is_range or store.opname != "STORE_FAST" or num_stores != 1:
+            is_local = found[place + 1].opname.startswith("STORE_FAST")
+            if not is_range or not is_local or sum(sets[0] <= each for each in sets) != 1:
                 return None
-            names.append(store.argval)
+            names += sets[0]
     return tuple(names)
+
+
+def _set_by(instruction: dis.Instruction) -> set[Any]:
+    """The names that an instruction sets. Since Python 3.13 there is `STORE_FAST_LOAD_FAST`, of two names."""
+    names, verbs = instruction.argval, instruction.opname.split("_FAST")
+    pairs = zip(names if isinstance(names, tuple) else (names,), verbs, strict=False)
+    return {name for name, verb in pairs if "STORE" in verb}
 
 
 def _is_range(code: CodeType, at: int) -> bool:
