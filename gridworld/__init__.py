@@ -7,6 +7,7 @@
     gridworld.ExactEvalCallback()           # exact curves in its own training
     gridworld.check("my_package.MyPPO")     # tests an algorithm on worlds with known answers
     gridworld.examine(env)                  # why nothing learns in an environment, and what to change
+    gridworld.playground("cliff")           # a page on which you draw worlds and watch Q-learning
     gym.make("gridworld:GridWorld-v0")      # the environment alone
 
 Importing it registers the environment and loads nothing else; torch is imported when a name needs it.

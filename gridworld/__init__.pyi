@@ -1,6 +1,8 @@
 # The public names, and where each is from: `__init__.py` reads them here, and type checkers do.
 from gridworld.agents.sb3.exact_eval import ExactEvalCallback as ExactEvalCallback
 from gridworld.agents.sb3.vec_env import make_vec_env as make_vec_env
+from gridworld.api.playground import Playground as Playground
+from gridworld.api.playground import playground as playground
 from gridworld.api.runs import RunResult as RunResult
 from gridworld.api.runs import diagnose as diagnose
 from gridworld.api.runs import open_run as open_run

@@ -15,6 +15,8 @@ from helpers.support import configure
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 
+import gridworld
+from gridworld.base.errors import InputError
 from gridworld.base.user_input import called_from
 from gridworld.commands import playground as command
 from gridworld.config.compose import named_world
@@ -275,10 +277,60 @@ def test_a_phone_shows_it_whole(scheme: str, name: str, page: Page, browser: Any
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
+LEARNED = """
+const { app, rate, Learner, score } = playground, { world, solution, process, hyper } = app;
+const steps = 10 * rate(), settings = { ...hyper, gamma: 0.99 };
+return Array.from({ length: 20 }, (_, seed) => {
+  let state = seed + 1;
+  const random = () => (state = (state * 48271) % 2147483647) / 2147483647;
+  const learner = new Learner(world, process.kind, settings, { world: random, agent: random });
+  while (learner.steps < steps) learner.step();
+  const policy = new Float64Array(learner.q.length), { A } = world;
+  for (let at = 0; at < policy.length; at += A) {
+    const row = Array.from(learner.q.subarray(at, at + A));
+    policy[at + row.indexOf(Math.max(...row))] = 1;
+  }
+  return score(world, solution, policy).certified;
+});
+"""
+
+
+@pytest.mark.parametrize("width", [390, 840])
+def test_a_frame_shows_learning_at_once(width: int, page: Page, browser: Any, tmp_path: Path) -> None:
+    """Numbers and curve are next to the board or right below it; in ten seconds every seed has learned."""
+    shown = gridworld.playground("classic")._repr_html_()
+    (tmp_path / "notebook.html").write_text(f'<!doctype html><body style="margin: 0">{shown}')
+    screen = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": False}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    try:
+        frame = page(name=tmp_path / "notebook.html").find_element("tag name", "iframe")
+        browser.switch_to.frame(frame)
+        assert browser.execute_script(LEARNED) == [True] * 20
+        browser.execute_async_script("setTimeout(arguments[0], 100)")
+        board, curve = (browser.find_element("id", each).rect for each in ("board", "curve"))
+        size = browser.execute_script("return [document.body.scrollWidth, document.body.offsetHeight]")
+        assert browser.find_element("css selector", "#modes [aria-checked=true]").text == "Q-learning"
+        browser.switch_to.default_content()
+        assert [frame.size["width"], frame.size["height"]] == size
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert curve["y"] + curve["height"] - board["y"] < 700
+    assert (curve["x"] > board["x"] + board["width"]) == (width == 840)
+
+
+def test_python_takes_the_words_of_the_command_and_a_run(run: Path) -> None:
+    page = gridworld.playground("cliff").html
+    assert page == gridworld.playground("env=cliff").html != gridworld.playground({"env.slip": 0.1}).html
+    assert gridworld.playground(gridworld.open_run(run)).html == gridworld.playground(run).html
+    with pytest.raises(InputError, match="the run has no folder"):
+        gridworld.playground(gridworld.train("agent=q_learning", total_timesteps=500, progress=False))
+
+
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        ("nowhere", "env=nowhere: no such world"),
+        ("nowhere", "env=nowhere: no such choice; choose from aima_4x3"),
+        ("clif --config-dir .", "did you mean cliff?"),
         ("nowhere.txt", "neither a shipped layout"),
         ("runs/", "runs: no such folder"),
         ("env=cliff maze", "maze: is not a setting; write env=maze"),
@@ -338,6 +390,10 @@ def test_the_browser_opens_it(
     monkeypatch.setattr(webbrowser, "open", lambda address: opened.append(address) is None)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     command.main(["env=cliff", "env.slip=0.25"])
-    (file,) = tmp_path.iterdir()
+    (file,) = tmp_path.glob("*/*")
     assert (opened, capsys.readouterr().out) == ([file.as_uri()], f"{file}\n")
     assert "&slip=0.25&" in file.read_text("utf-8")
+    (tmp_path / "my map.txt").write_text("S.G\n")
+    monkeypatch.chdir(tmp_path)
+    command.main(["my map.txt", "--config-dir", ".", "--out", "page.html"])
+    assert '"link":"map=S.G&' in Path("page.html").read_text("utf-8")

@@ -1,12 +1,14 @@
 // What people do: they draw a world, choose what to watch, play it, and take it with them.
 
-import { $, agent, app, commandLine, data, drawMap, FIELDS, fitsRun, h, HYPER, isMap, LEARNERS } from "./show.js";
+import { $, agent, app, commandLine, data, drawMap, FIELDS, fitsRun, h, HYPER, isEmbedded, isMap, LEARNERS } from "./show.js";
 import { MODES, rate, refresh, run, say, select, shipped, showCell, showControls, SHOWS, TOOLS } from "./show.js";
 import { evaluate, outcome, score, solve, split } from "./solver.js";
 import { drawOutcome, drawStart, Learner, PolicyIteration, ValueIteration } from "./learners.js";
 import { short } from "./view.js";
 import { check, checked, compile, emptyMap, fromTables, link, mapText, Mistake } from "./world.js";
 import { MOST_CELLS, MOST_SIDE, parse, readLink, SETTINGS } from "./world.js";
+
+const hasAddress = location.protocol !== "about:"; // none in a notebook
 
 // ---- the world ------------------------------------------------------------------------------------------
 
@@ -23,7 +25,7 @@ function setWorld(map, settings, keep = false) {
   if (isMap) {
     app.link = link(map, settings, shipped);
     clearTimeout(app.linking); // browsers refuse too many changes of the address
-    app.linking = setTimeout(() => history.replaceState(null, "", `#${app.link}`), 200);
+    if (hasAddress) app.linking = setTimeout(() => history.replaceState(null, "", `#${app.link}`), 200);
     buildGrid();
   }
   const { process, world } = app, learnsOn = keep && process instanceof Learner;
@@ -330,8 +332,14 @@ function start() {
     for (const box of [...unused, $("slip").parentNode, $("step_reward").parentNode]) box.hidden = true;
     setWorld(null, { ...SETTINGS, gamma: data.gamma });
   }
+  $("copy-link").hidden = !hasAddress;
+  if (isEmbedded) {
+    document.documentElement.className = "embedded";
+    const tell = () => parent.postMessage({ playground: document.body.offsetHeight }, "*"); // `FRAME` of page.py listens
+    new ResizeObserver(tell).observe(document.body);
+  }
   requestAnimationFrame(frame);
 }
 
 start();
-globalThis.playground = { app, compile, evaluate, Learner, outcome, parse, score, solve, split }; // for the console
+globalThis.playground = { app, compile, evaluate, Learner, outcome, parse, rate, score, solve, split }; // for the console

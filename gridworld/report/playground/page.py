@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -20,8 +23,10 @@ from numpy.typing import NDArray
 from gridworld.base.console import plain, tell
 from gridworld.base.errors import InputError
 from gridworld.base.serialization import StateError, fitting
-from gridworld.config.words import conf_folder
-from gridworld.config.worlds import MapConfig
+from gridworld.config.compose import compose
+from gridworld.config.recipe_file import literal
+from gridworld.config.words import conf_folder, refuse_unclear
+from gridworld.config.worlds import MapConfig, each_once
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.training.saved_run import SavedRun, read_visits
 from gridworld.visualization.picture import Moment, PolicyHistory
@@ -36,6 +41,33 @@ _LONGEST_NAME = 80
 _DIGITS = 6  # of values in a run's history, which has them as float32
 _SETTINGS = ("slip", "step_reward", "goal_reward", "trap_reward")
 GAMMA = 0.99
+# Shows the page in another one, as high as it is: {} is `src=` or `srcdoc=`.
+FRAME = """<iframe class="playground" {} title="The playground" loading="lazy" \
+style="width: 100%; height: 1100px; border: 0"></iframe>
+<script>addEventListener("message", ({{ data, source }}) => document.querySelectorAll(".playground").forEach(
+frame => frame.contentWindow === source && (frame.style.height = `${{data.playground}}px`)))</script>"""
+
+
+def page_of(words: Sequence[str], conf: Sequence[str] = (), best: bool = False, trust: bool = False) -> str:
+    """The page of what a command line names: a world, a map file, settings as for `train`, a run's folder."""
+    alone = words[0] if len(words) == 1 else ""
+    is_path = Path(alone).exists() or os.sep in alone.partition("=")[0]  # a run of a sweep may be seed=0
+    name = alone if is_path or "=" not in alone else ""
+    if name.endswith(os.sep) or (name and Path(name).is_dir()):
+        return run_page(SavedRun(Path(name), trust, best))
+    if folders := [word for word in words if Path(word).is_dir()]:
+        raise InputError(f"{folders[0]}: is a folder; give it alone, since a run has its own settings")
+    if os.sep in name and not Path(name).exists():
+        raise InputError(f"{name}: no such run or map file")
+    if best:
+        raise InputError("--best: chooses between the models of a run; give the run's folder")
+    if name:
+        words = [f"env.layout={literal(name, 'layout')}" if name.endswith(".txt") else f"env={name}"]
+    refuse_unclear([*words, *conf])
+    world = each_once()
+    config = compose([*words, *conf], world)
+    mdp = world(config.env)
+    return world_page(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
 
 
 def world_page(mdp: Mdp, gamma: float, step_limit: int) -> str:

@@ -7,6 +7,7 @@ import { cellName, command, mapText, SETTINGS } from "./world.js";
 
 export const $ = id => document.getElementById(id);
 export const data = JSON.parse($("data").textContent), { shipped, run } = data, isMap = !data.tables;
+export const isEmbedded = parent !== self; // in a page of the documentation, or in a notebook
 export const LEARNERS = { q_learning: "Q-learning", sarsa: "SARSA", expected_sarsa: "Expected SARSA" };
 const PLANNERS = { optimum: "Optimum", value_iteration: "Value iteration", policy_iteration: "Policy iteration" };
 export const MODES = { ...(run && { run: "Run" }), ...PLANNERS, ...LEARNERS };
@@ -29,8 +30,8 @@ export const HYPER = [
 ];
 export const app = {
   ...{ map: null, settings: { ...SETTINGS }, world: null, solution: null, problem: "", undo: [] },
-  ...{ mode: run ? "run" : "optimum", tool: "look", show: "value", selected: -1, hovered: -1 },
-  ...{ hyper: { epsilon: 0.1, rate: 0.5, power: 0, initial: 0 }, process: null, moment: 0, curve: [], old: [] },
+  ...{ mode: run ? "run" : isEmbedded ? "q_learning" : "optimum", tool: "look", show: "value", selected: -1, hovered: -1 },
+  ...{ hyper: { epsilon: 0.1, rate: 0.5, power: 0, initial: 1 }, process: null, moment: 0, curve: [], old: [] },
   ...{ playing: false, following: false, credit: 0, episode: null, scored: null, slow: 0 },
 };
 
@@ -165,8 +166,8 @@ function many(n) {
 
 export function drawMap() {
   const { map, world, solution, now, scored, mode } = app, board = $("board");
-  const most = Math.max(260, Math.min(window.innerHeight - 230, 760));
-  const width = Math.min($("stage").clientWidth, 118 * map.cols, (most / map.rows) * map.cols);
+  const most = isEmbedded ? 380 : Math.max(260, Math.min(window.innerHeight - 230, 760));
+  const width = Math.min($("modes").clientWidth, 118 * map.cols, (most / map.rows) * map.cols);
   Object.assign(board.style, { width: `${width}px`, height: `${(width / map.cols) * map.rows}px` });
   const nothing = { palette: "viridis", of: () => null, number: () => "" }, shown = world ? scale() : nothing;
   const isShown = (s, a) => (mode === "optimum" ? solution.optimal[s * 4 + a] : a === now.greedy[s]);
