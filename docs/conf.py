@@ -2,6 +2,7 @@
 
 import re
 import sys
+import tomllib
 from pathlib import Path
 
 from docutils import nodes
@@ -13,7 +14,11 @@ import notebook
 import option_tables
 
 import gridworld
-from gridworld.report.playground.page import maps_page
+from gridworld.report.playground.page import FRAME, maps_page
+
+README = Path(__file__).parent.with_name("README.md")
+PROJECT = tomllib.loads(README.with_name("pyproject.toml").read_text("utf-8"))["project"]
+ADDRESS = PROJECT.get("urls", {}).get("Repository")
 
 project = "gridworld"
 author = "the gridworld maintainers"
@@ -23,7 +28,7 @@ version = release = gridworld.__version__
 extensions = ["myst_parser", "sphinx_copybutton", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 source_suffix = {".md": "markdown", ".ipynb": "markdown"}  # `fill` makes Markdown of notebooks
 exclude_patterns = ["_build", "examples", "course/solutions"]
-myst_enable_extensions = ["deflist"]
+myst_enable_extensions = ["deflist", "html_image"]
 myst_heading_anchors = 3
 default_role = "code"  # docstrings have names between single backquotes, as in Markdown
 autodoc_typehints = "description"
@@ -33,6 +38,8 @@ napoleon_use_ivar = True
 html_theme = "furo"
 html_math_renderer = "mathml"
 html_title = "gridworld"
+icon = {"name": "Repository", "url": ADDRESS, "html": "Repository", "class": ""}
+html_theme_options = {"footer_icons": [icon] if ADDRESS else []}
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 MATH = '---\nmyst: {enable_extensions: ["dollarmath"]}\n---\n'
@@ -63,7 +70,13 @@ def redirect(folder):
 
 
 def fill(path, source):
-    """Fill in the pages of options and of the notebook, and make a page of a lab sheet."""
+    """Fill in the start page and those of options and of the notebook, and make a page of a lab sheet."""
+    if path.match("docs/index.md"):
+        start = README.read_text("utf-8").split("<!-- Until here")[0]
+        start = start.replace("(docs/examples/quickstart.ipynb)", "(docs/tutorials/quickstart.md)")
+        source[0] = source[0].replace("<!-- README.md, until it says so -->", start.replace("docs/", ""))
+        frame = FRAME.format('src="playground.html"')
+        source[0] = source[0].replace("<!-- the playground -->", f"```{{raw}} html\n{frame}\n```")
     if path.match("reference/options.md"):
         source[0] = option_tables.fill(source[0])
     if path.match("tutorials/quickstart.md"):

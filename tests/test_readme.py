@@ -13,10 +13,15 @@ from helpers.support import ROOT, script
 import gridworld
 
 INSTALL, *OTHERS = blocks(README, "bash")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+KNOWN = PROJECT.get("urls", {}).get("Repository")  # the one setting of the address
+ADDRESS = KNOWN or "ADDRESS"  # where none is known, a placeholder
 
 
 def test_the_first_two_commands_are_the_ones_ci_runs() -> None:
-    assert INSTALL.text.strip() == "pip install -e . && python scripts/train.py agent=dqn"
+    clone, install = INSTALL.lines
+    assert clone.split()[::2] == ["git", ADDRESS, "&&", "gridworld"]
+    assert install == "pip install -e . && python scripts/train.py agent=dqn"
     assert "pip install -e '.[test]' && python -m pytest" in [block.text.strip() for block in OTHERS]
     assert "README.md" in (ROOT / ".ci" / "run").read_text()
 
@@ -27,7 +32,7 @@ def test_it_is_short() -> None:
 
 
 def test_the_main_job_prints_what_the_readme_shows(tmp_path: Path) -> None:
-    _, path, *words = shlex.split(INSTALL.text.split("&&")[1])
+    _, path, *words = shlex.split(INSTALL.lines[-1].split("&&")[1])
     done = script(Path(path).name, *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     shown = next(block.text for block in blocks(README, "text") if "greedy" in block.text)
@@ -66,10 +71,10 @@ def test_what_it_names_exists(page: Path) -> None:
 
 
 def test_the_version_is_in_the_citation_and_the_changelog() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     citation = yaml.safe_load((ROOT / "docs" / "CITATION.cff").read_text())
     assert citation["version"] == gridworld.__version__
-    assert citation["license"] == project["license"]
+    assert citation["license"] == PROJECT["license"]
+    assert citation.get("repository-code") == KNOWN
     sections = re.findall(r"^## (.*)", (ROOT / "docs" / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert sections[0] == "[Unreleased]"
     assert all(re.fullmatch(r"\[\d+\.\d+\.\d+\] - \d{4}-\d\d-\d\d", each) for each in sections[1:])

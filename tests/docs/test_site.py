@@ -5,12 +5,14 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from urllib.parse import unquote, urlsplit
 
 import pytest
 from helpers.browser import chromium
 from helpers.support import ROOT
 
 FORMULA = re.compile(r"\$\$.+?\$\$|\$.+?\$", re.DOTALL)
+PARTS = ("table", "img.align-right", "iframe")
 WIDTHS = (390, 1280, 1440, 1600)
 PAGES = (  # by what may be too wide: pictures, tables, long commands, tables of options, signatures, formulas
     "index",
@@ -47,6 +49,29 @@ def test_the_sheets_are_pages_whose_formulas_need_no_network(site: Path) -> None
         [notebook] = (site / "_downloads").rglob(sheet.name)
         assert notebook.read_bytes() == sheet.read_bytes()
     assert not (site / "course" / "solutions").exists()
+
+
+@pytest.mark.slow
+def test_the_first_screen_says_how_to_start_and_where_to_go(site: Path, tmp_path: Path) -> None:
+    """With the README's words. The playground below is as high as it is."""
+    with chromium(tmp_path) as browser:
+        screen = {"width": 1280, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+        browser.get((site / "index.html").as_uri())
+        code, output = browser.find_elements("css selector", "article pre")
+        doors, picture, frame = (browser.find_element("css selector", f"article {each}") for each in PARTS)
+        assert code.text in (ROOT / "README.md").read_text("utf-8")
+        assert "certified optimal" in output.text
+        assert doors.rect["y"] + doors.rect["height"] <= 900
+        assert picture.rect["x"] > output.rect["x"] + output.rect["width"]
+        links = [each.get_attribute("href") for each in doors.find_elements("tag name", "a")]
+        assert all(Path(unquote(urlsplit(link).path)).is_file() for link in links)
+        browser.execute_script("arguments[0].scrollIntoView()", frame)
+        browser.switch_to.frame(frame)
+        browser.execute_async_script("setTimeout(arguments[0], 500)")
+        height = browser.execute_script("return document.body.offsetHeight")
+        browser.switch_to.default_content()
+        assert frame.size["height"] == height
 
 
 @pytest.mark.slow

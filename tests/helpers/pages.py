@@ -148,7 +148,9 @@ class Reader:
         if again in self._ran:
             return
         self._ran.add(again)
-        if line.startswith("pip install ") or "benchmark.py" in line:  # commands/test_commands.py measures so
+        if (
+            line.startswith(("pip install ", "git clone ")) or "benchmark.py" in line
+        ):  # commands/test_commands.py measures so
             check(line)
             return
         done = self._run(line)

@@ -189,7 +189,7 @@ export function drawCurve(canvas, lines, unit, mark) {
     ctx.textAlign = "right";
     write(ctx, short(mostY * share), left - 6, y, colours.muted, "11px");
   }
-  write(ctx, `${mostX.toLocaleString("en")} ${unit}`, right, height - 7, colours.muted, "11px");
+  if (mostX > 1) write(ctx, `${mostX.toLocaleString("en")} ${unit}`, right, height - 7, colours.muted, "11px");
   ctx.textAlign = "left";
   lines.forEach(({ points: own, colour, dash, label }, i) => {
     ctx.setLineDash(dash ?? []);
