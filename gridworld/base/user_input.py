@@ -46,6 +46,10 @@ DAMAGED = (  # what numpy and zipfile raise for a file that is none of theirs
     *(RuntimeError, struct.error, zipfile.BadZipFile, zlib.error, tokenize.TokenError),
 )
 COPIES = 3  # the file, its arrays, and what is computed while they are checked
+LIBRARIES = (  # of classes that an agent is made of, which anybody's run may name
+    *("torch.nn.", "torch.optim.", "stable_baselines3.", "sb3_contrib."),
+    *("gridworld.agents.sb3.features.", "gridworld.agents.sb3.replay_counts."),
+)
 _EXTRAS = {"sb3_contrib": ("sb3-contrib", "contrib")}  # of modules: the package, and what installs it
 
 
@@ -167,34 +171,23 @@ def npz_arrays(
 
 
 def named_object(where: str, name: str) -> Any:
-    """What `module:NAME` or `folder/module.py:NAME` names, where a person typed it; None: no such name.
+    """What `module.NAME`, `module:NAME` or `folder/module.py:NAME` names; None: its module has no such name.
 
-    The module may be in the current folder.
+    A module that is not of `LIBRARIES` may be in the current folder, too: a person typed its name, or trusts
+    whoever did.
     """
-    place, _, attribute = name.rpartition(":")
+    place, _, attribute = name.rpartition(":" if ":" in name else ".")
+    if attribute == "py":
+        raise InputError(f"{where}: names a file; add what to take from it, as {name}:NAME")
     file = (users_folder() / place).resolve() if place.endswith(".py") else None
     if file is not None and not file.is_file():
-        raise InputError(f"{where}={name}: no file {place}; give module:NAME or folder/module.py:NAME")
-    search(users_folder() if file is None else file.parent)
-    return _named(f"{where}={name}", place if file is None else file.stem, attribute, file)
-
-
-def search(folder: Path) -> None:
-    """Let Python find the modules in a folder, after all that is installed."""
-    if str(folder) not in sys.path:
-        sys.path.append(str(folder))
+        raise InputError(f"{where}: no file {place}; give module:NAME or folder/module.py:NAME")
+    folder = str(users_folder() if file is None else file.parent)
+    if not name.startswith(LIBRARIES) and folder not in sys.path:
+        sys.path.append(folder)  # after all that is installed
     importlib.invalidate_caches()
-
-
-def imported(where: str, path: Any) -> Any:
-    """Import what a path in the setting `where` names; None where its module has no such name."""
-    module, _, name = str(path).rpartition(".")
-    return _named(f"{where}={path}", module, name)
-
-
-def _named(where: str, module: str, name: str, file: Path | None = None) -> Any:
     try:
-        return getattr(import_module(module) if file is None else _of_file(module, file), name, None)
+        return getattr(import_module(place) if file is None else _of_file(file.stem, file), attribute, None)
     except ModuleNotFoundError as error:
         if error.name in _EXTRAS:
             package, extra = _EXTRAS[error.name]
@@ -204,7 +197,7 @@ def _named(where: str, module: str, name: str, file: Path | None = None) -> Any:
     except (ValueError, TypeError):  # no path at all
         return None
     except (Exception, SystemExit) as error:  # a module of the user's own may raise anything
-        what = f"{module} cannot be imported ({type(error).__name__}: {error})"
+        what = f"{place} cannot be imported ({type(error).__name__}: {error})"
         raise InputError(f"{where}: {what}") from error
 
 

@@ -155,7 +155,10 @@ def check(
             raise InputError(str(error).replace("agent.arguments.", "--set ")) from None
     findings, follows = list[Finding](), {probe.name: probe.follows for probe in chosen}
     check_group = partial(_check_group, config, given, seed, steps)
-    with ProcessPoolExecutor(max(1, min(processes, len(groups))), get_context("spawn")) as pool:
+    # A process imports a module by its file before it is sent what is in it.
+    again = partial(subject, algorithm, observation) if ":" in str(algorithm) else None
+    count = max(1, min(processes, len(groups)))
+    with ProcessPoolExecutor(count, get_context("spawn"), again) as pool:
         results = itertools.chain.from_iterable((map if processes == 1 else pool.map)(check_group, groups))
         for finding in results:
             if finding.passed is False:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -121,11 +122,12 @@ def _arguments_of(kind: type) -> list[str]:
 
 def subject(algorithm: Any, observation: str = "state") -> AgentConfig:
     """The settings of a train function, a class with SB3's interface or a shipped agent, also by name."""
-    if isinstance(algorithm, str) and ":" in algorithm:
-        found = named_object("check", algorithm)
+    if isinstance(algorithm, str) and re.search(r":|\.py$", algorithm):
+        found = named_object(f"check {algorithm}", algorithm)
         if not callable(found):
             raise InputError(f"check {algorithm}: must be a function, as module:function")
-        return dataclasses.replace(subject(found, observation), name=algorithm)
+        if not inspect.isclass(found):
+            return dataclasses.replace(subject(found, observation), name=algorithm)
     if observation not in OBSERVATIONS:
         raise InputError(f"observation={observation!r}: must be {' or '.join(OBSERVATIONS)}")
     if callable(algorithm) and not inspect.isclass(algorithm):
@@ -136,7 +138,7 @@ def subject(algorithm: Any, observation: str = "state") -> AgentConfig:
     if inspect.isclass(algorithm):
         algorithm = f"{algorithm.__module__}.{algorithm.__qualname__}"
     name = str(algorithm)
-    if "." in name:
+    if re.search("[.:]", name):
         return SB3ClassConfig(name=name, algorithm=name, engine="stock")
     from gridworld.config.compose import compose
     from gridworld.config.messages import meant

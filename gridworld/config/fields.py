@@ -15,15 +15,12 @@ from enum import Enum, IntEnum, auto
 from typing import Annotated, Any
 
 from gridworld.base.bounds import Bounds
+from gridworld.base.user_input import LIBRARIES
 
 MISSING = "???"  # OmegaConf's sign for a value that has to be given
 MOST_KEPT = 10**9  # episodes that a mean is taken over
 EFFECTS, PRIVILEGE, BOUNDS, RATE = "effects", "privilege", "bounds", "rate"  # keys of a field's metadata
 
-LIBRARIES = (  # of classes that an agent is made of
-    *("torch.nn.", "torch.optim.", "stable_baselines3.", "sb3_contrib."),
-    *("gridworld.agents.sb3.features.", "gridworld.agents.sb3.replay_counts."),
-)
 _OF_LIBRARIES = rf"({'|'.join(map(re.escape, LIBRARIES))})[\w.]+"
 _OF_KEYWORD = r"[\w+-]*"
 _CALLED = "is called with the arguments given, and may write files"
@@ -98,7 +95,7 @@ class Text(Enum):
     WORD = r"(?s).*", "is a word", Use.OPEN  # compared, looked up among the program's own, or shown
     CHOICE = r"\w[\w.-]*(/\w[\w.-]*)*", "leads out of the folder of choices", Use.COMPOSE
     FILE = r"[^\x00]*", "leads out of the current folder", Use.COMPOSE  # nor outside, by links or otherwise
-    CLASS = rf"[^.]*|{_OF_LIBRARIES}", f"is not from one of {', '.join(LIBRARIES)}", Use.OPEN
+    CLASS = rf"[^.:]*|{_OF_LIBRARIES}", f"is not from one of {', '.join(LIBRARIES)}", Use.OPEN
     UNKNOWN = r"\?\?\?", _CALLED, Use.OPEN
     CALLBACK = r"\?\?\?", _CALLED, Use.REPEAT
     BUILDER = r"\?\?\?", _CALLED, Use.COMPOSE

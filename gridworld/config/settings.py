@@ -19,11 +19,9 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from gridworld.base.console import printable
 from gridworld.base.errors import InputError
-from gridworld.base.user_input import users_folder
+from gridworld.base.user_input import LIBRARIES, users_folder
 from gridworld.config.fields import (
     EFFECTS,
-    LIBRARIES,
-    MISSING,
     PRIVILEGE,
     Effect,
     Text,
@@ -251,8 +249,8 @@ def read_config(content: Any, where: str) -> TrainConfig:
     agent = agent if isinstance(agent, dict) else {}
     algorithm, schemas = agent.get("algorithm"), agent_schemas().values()
     own = [schema for schema in schemas if schema.algorithm == algorithm]
-    if not own and "arguments" in agent:  # of any class, whose schema names no algorithm
-        own = [schema for schema in schemas if schema.algorithm == MISSING]
+    if not own:  # a class of one's own, whose schema shows in the other keys
+        own = [each for each in schemas if each.known_by and each.known_by in agent]
     if not own:
         raise InputError(f"{where}: config.agent.algorithm={_shown(algorithm)} is unknown")
     stand_in = {AgentConfig: own[0], EnvConfig: schema_of(content.get("env"))}

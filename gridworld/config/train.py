@@ -11,6 +11,7 @@ report's page read the table `PICTURES`. To add one, add a field to `RecordingCo
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,7 @@ class AgentConfig:
     name: Word = setting(MISSING, affects(Effect.LABELS))  # in tables and folders
     family: Word = MISSING  # the package in `gridworld.agents`
     algorithm: ClassPath = MISSING  # the class, by its import path where it is none of ours
+    known_by = ""  # a setting that only its classes have; "": `algorithm` can be no class derived from it
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -73,7 +75,8 @@ class AgentConfig:
         """Check a run's settings; InputError: the first one that could not train as it says."""
         for key in ("family", "algorithm"):
             given, own = getattr(self, key), getattr(type(self), key)
-            if own not in (given, MISSING):
+            is_derived = self.known_by and key == "algorithm" and re.search("[.:]", given)
+            if own not in (given, MISSING) and not is_derived:
                 raise InputError(f"agent.{key}={given}: these settings are {own}'s; choose agent=...")
 
     def build(self, context: Any) -> Any:

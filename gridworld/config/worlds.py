@@ -253,8 +253,8 @@ def _compiled(
 
 
 def is_id(text: str) -> bool:
-    """Whether a text has the form of an environment's name, as in `GymnasiumConfig.id`."""
-    return re.search(r"(-v\d+|[\w.]:[A-Za-z_]\w*)$", text) is not None
+    """Whether a text has the form of an environment's name, as in `GymnasiumConfig.id`, or of its file."""
+    return re.search(r"(-v\d+|\.py|[\w.]:[A-Za-z_]\w*)$", text) is not None
 
 
 World = Callable[[EnvConfig], "Mdp"]  # makes the world of these settings

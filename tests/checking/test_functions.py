@@ -232,6 +232,17 @@ def test_a_bug_is_blamed_once() -> None:
     assert "may follow" not in str(alone)
 
 
+def test_a_function_in_a_file_is_found_by_other_processes_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where a module of Python's has the file's name."""
+    (tmp_path / "random.py").write_text("def train(env, total_timesteps, seed):\n    return lambda state: 1\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    result = gridworld.check("random.py:train", probes=["choice", "delay"], processes=2)
+    assert [each.name for each in result.findings] == ["choice", "delay"]
+
+
 PLUGIN = """
 def test_right(gridworld_check):
     assert gridworld_check(lambda env, total_timesteps, seed: [1, 0], probes=["choice"]).passed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -25,7 +26,7 @@ from gridworld.agents.sb3.settings import FALLING, SCHEDULES, SB3ClassConfig, SB
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.base.bounds import falls, parse_schedule
 from gridworld.base.errors import InputError, in_short
-from gridworld.base.user_input import check_memory, imported, is_limited
+from gridworld.base.user_input import check_memory, is_limited, named_object
 from gridworld.base.workarounds import generator_of, keep_compiler_out
 from gridworld.world.mdp import leaves_of
 
@@ -68,9 +69,9 @@ def algorithm_and_arguments(
     `features` is what the observation adds to the settings of an `MlpPolicy`, which is a `MultiInputPolicy`
     where observations are a Dict.
     """
-    is_any = isinstance(config, SB3ClassConfig)
-    path = config.algorithm if is_any else f"{stable_baselines3.__name__}.{config.algorithm}"
-    algorithm = algorithm_class("agent.algorithm", path)
+    name = type(config).algorithm  # of a class of SB3's, from which another may be derived
+    own = BaseAlgorithm if isinstance(config, SB3ClassConfig) else getattr(stable_baselines3, name)
+    algorithm = own if config.algorithm == name else import_class("agent.algorithm", config.algorithm, own)
     arguments = {
         name: _converted(f"{config.where}.{name}", name, each) for name, each in config.given.items()
     }
@@ -97,10 +98,11 @@ def algorithm_class(where: str, path: Any) -> type[BaseAlgorithm]:
 
 def import_class(where: str, path: Any, kind: type) -> Any:
     """Import a class that is derived from `kind`; `where` is the setting that has its path, for messages."""
-    found = imported(where, path)
+    where = f"{where}={path}"
+    found = named_object(where, str(path))
     if not (inspect.isclass(found) and issubclass(found, kind)):
         what = "class" if kind is object else f"{kind.__name__} class"
-        raise InputError(f"{where}={path}: must be the import path of a {what}, as package.module.Name")
+        raise InputError(f"{where}: must be the import path of a {what}, as package.module.Name")
     return found
 
 
@@ -108,7 +110,7 @@ def _policy(config: SB3Config, algorithm: type[BaseAlgorithm], sees_dict: bool) 
     name = "MultiInputPolicy" if sees_dict and config.policy == "MlpPolicy" else config.policy
     if name in algorithm.policy_aliases:
         return algorithm.policy_aliases[name]
-    if "." in config.policy:
+    if re.search("[.:]", config.policy):
         policy: type[BasePolicy] = import_class("agent.policy", config.policy, BasePolicy)
         return policy
     known = ", ".join(algorithm.policy_aliases)

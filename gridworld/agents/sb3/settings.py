@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
@@ -164,7 +165,7 @@ class SB3Config(AgentConfig):
             raise InputError(f"agent.engine={self.engine}: must be tabulated or stock")
         for index, entry in enumerate(run.callbacks):
             path = entry.get("_target_") if isinstance(entry, dict) else None
-            if not isinstance(path, str) or "." not in path:
+            if not isinstance(path, str) or not re.search("[.:]", path):
                 raise InputError(
                     f"callbacks[{index}]={entry}: must be a mapping of _target_, the import path of a "
                     "callback's class, and its arguments"
@@ -209,6 +210,8 @@ class SB3Config(AgentConfig):
 @dataclass
 class SB3ClassConfig(SB3Config):
     """Any class of Stable-Baselines3, of sb3-contrib or a custom one, by its import path."""
+
+    known_by = "arguments"
 
     arguments: Arguments = field(  # of the class; it keeps its defaults
         default_factory=dict, metadata=affects(Effect.LEARNING, stats_window_size=Effect.LABELS)
@@ -260,6 +263,7 @@ class SB3CheckedConfig(SB3Config):
 class DQNConfig(SB3CheckedConfig):
     """Arguments of `stable_baselines3.DQN`, with its defaults."""
 
+    known_by = "buffer_size"
     name: Word = "dqn"
     algorithm: Word = "DQN"
     log_interval: int = 4
@@ -297,6 +301,7 @@ class DQNConfig(SB3CheckedConfig):
 class PPOConfig(SB3CheckedConfig):
     """Arguments of `stable_baselines3.PPO`, with its defaults."""
 
+    known_by = "n_epochs"
     name: Word = "ppo"
     algorithm: Word = "PPO"
     policy_kwargs: ActorCriticPolicyKwargs = field(default_factory=ActorCriticPolicyKwargs)

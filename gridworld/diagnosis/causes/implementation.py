@@ -10,7 +10,7 @@ import inspect
 import time
 from dataclasses import replace
 
-from gridworld.agents.sb3.settings import SB3ClassConfig
+from gridworld.agents.sb3.settings import SB3ClassConfig, SB3Config
 from gridworld.base.errors import InputError
 from gridworld.config.train import AgentConfig
 from gridworld.diagnosis.evidence import Evidence, Finding
@@ -40,10 +40,12 @@ def faulty_class(run: Evidence) -> Finding | None:
     return Finding("implementation", run.split.wrong, why, (f"agent.algorithm={sound.algorithm}",))
 
 
-def of_library(config: AgentConfig) -> SB3ClassConfig | None:
+def of_library(config: AgentConfig) -> SB3Config | None:
     """The same settings for the library's class that a class is derived from; None: it is that itself."""
-    if not isinstance(config, SB3ClassConfig):
+    if not isinstance(config, SB3Config) or config.algorithm == type(config).algorithm:
         return None
+    if not isinstance(config, SB3ClassConfig):
+        return replace(config, algorithm=type(config).algorithm, engine="tabulated")
     from gridworld.agents.sb3.factory import algorithm_class  # imports torch
 
     kinds = algorithm_class("agent.algorithm", config.algorithm).__mro__
@@ -57,7 +59,7 @@ def of_library(config: AgentConfig) -> SB3ClassConfig | None:
 
 
 def _certified_after(
-    run: Evidence, agent: SB3ClassConfig, seed: int, until: float, to_the_end: bool
+    run: Evidence, agent: SB3Config, seed: int, until: float, to_the_end: bool
 ) -> int | None:
     """The steps until a certificate, the first or that at the end; None: there is none, or not in time."""
     config = replace(run.config, agent=agent, seed=seed, callbacks=[])

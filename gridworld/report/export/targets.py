@@ -13,6 +13,7 @@ import dataclasses
 import json
 import logging
 import os
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -201,7 +202,8 @@ def _sb3_scores(run: ExportedRun) -> dict[str, float]:
 
 
 def _card(run: ExportedRun) -> str:
-    algorithm, is_sb3 = run.config.agent.algorithm, run.config.agent.family == "sb3"
+    is_sb3 = run.config.agent.family == "sb3"
+    algorithm = re.sub(r".*/|\.py(?=:)", "", run.config.agent.algorithm).replace(":", ".")  # to import it by
     if not all(part.isidentifier() for part in algorithm.split(".")):
         raise InputError(
             f"config.agent.algorithm={algorithm[:80]!r}: must be the name or import path of a class"

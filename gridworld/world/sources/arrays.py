@@ -42,12 +42,10 @@ from gridworld.base.errors import InputError, in_short
 from gridworld.base.user_input import (
     DAMAGED,
     check_memory,
-    imported,
+    named_object,
     npz_arrays,
     npz_bytes,
     open_users_file,
-    search,
-    users_folder,
 )
 from gridworld.world.mdp import Mdp, frozen, leaves_of
 from gridworld.world.outcomes import (
@@ -151,8 +149,7 @@ def build(builder: str | Callable[..., Any], kwargs: Mapping[str, Any] | None = 
         The world, named after the function unless what that returns has a name.
     """
     where = f"env.builder={_name_of(builder) if callable(builder) else str(builder)[:200]}"
-    search(users_folder())
-    function = imported("env.builder", builder) if isinstance(builder, str) else builder
+    function = named_object(where, builder) if isinstance(builder, str) else builder
     if not callable(function):
         raise InputError(f"{where}: must be the import path of a function, e.g. my_package.worlds.make")
     mdp, again = (_built(where, function, dict(kwargs or {})) for _ in range(2))

@@ -129,8 +129,8 @@ def make_env(env_id: str, kwargs: Mapping[str, Any] | None = None, render_mode: 
         raise InputError(
             f"env.kwargs: render_mode={arguments['render_mode']} is not part of the world; leave it out"
         )
-    module, _, name = env_id.rpartition(":")
-    found = named_object("env.id", env_id) if module else None
+    name = env_id.rpartition(":")[2]
+    found = named_object(where, env_id) if re.search(r":|\.py$", env_id) else None
     if found is not None:
         if not callable(found):
             raise InputError(

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from helpers.own_class import OWN_CLASS, any_class, importable
 from helpers.resuming import begin, differences, go_on, left_behind, rows, stopped_after
-from helpers.support import NO_FILES, SHORT, configure, script
+from helpers.support import NO_FILES, SHORT, configure, script, train_in
 
 import gridworld
 from gridworld.agents.sb3.model_file import read_weights
@@ -269,7 +269,7 @@ def test_ones_own_class_in_ones_own_yaml(tmp_path: Path, monkeypatch: pytest.Mon
     (tmp_path / "my_conf" / "agent").mkdir(parents=True)
     (tmp_path / "my_conf" / "agent" / "mine.yaml").write_text(OWN_YAML)
     words = ("--config-dir", "my_conf", "agent=mine", "hydra.run.dir=out", "agent.arguments.caution=0.9")
-    done = script("train.py", *words, cwd=tmp_path, PYTHONPATH=str(tmp_path))
+    done = script("train.py", *words, cwd=tmp_path)  # which finds the module in its folder
     assert done.returncode == 0, done.stderr
     assert "mine on classic, seed 0: 500 steps" in done.stdout
     settings = json.loads((tmp_path / "out" / "manifest.json").read_text())["config"]["agent"]
@@ -279,6 +279,55 @@ def test_ones_own_class_in_ones_own_yaml(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(InputError, match=r"algorithm=my_agents\.Mine is not from one of"):
         SavedRun(tmp_path / "out").snapshot()
     assert SavedRun(tmp_path / "out", trust=True).snapshot().greedy.shape == (30,)
+
+
+DERIVED = """
+import stable_baselines3
+from stable_baselines3.common.callbacks import BaseCallback
+
+class MyDQN(stable_baselines3.DQN): pass
+class MyPPO(stable_baselines3.PPO): pass
+class Counts(BaseCallback):
+    def _on_step(self): return True
+"""
+
+
+@pytest.mark.parametrize("named", ["derived.{}", "derived:{}", "derived.py:{}", "others/random.py:{}"])
+def test_a_class_derived_from_a_known_one_has_its_settings(
+    named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is found in the current folder, by a file also where a module of Python's has the name."""
+    (tmp_path / "others").mkdir()
+    for name in ("derived.py", "others/random.py"):
+        (tmp_path / name).write_text(DERIVED)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.delitem(sys.modules, "derived", raising=False)
+    counts = f"callbacks=[{{_target_: '{named.format('Counts')}'}}]"
+    for agent, kind in (("dqn", "MyDQN"), ("ppo", "MyPPO")):
+        words = [*SHORT[agent], *NO_FILES, f"agent.algorithm={named.format(kind)}", counts]
+        train_in(tmp_path / agent, *words)
+        with pytest.raises(InputError, match="is not from one of"):
+            SavedRun(tmp_path / agent).snapshot()
+        model: Any = SavedRun(tmp_path / agent, trust=True).agent().model
+        assert type(model).__name__ == kind
+        assert model.gamma == configure(*words).agent.gamma
+    with pytest.raises(InputError, match="must be the import path of a DQN class"):
+        train_in(tmp_path / "wrong", *SHORT["dqn"], f"agent.algorithm={named.format('MyPPO')}")
+
+
+def test_a_librarys_name_is_not_looked_up_in_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Anybody's run may name it, and be opened in a folder with a module of the library's name."""
+    train_in(tmp_path / "run", *SHORT["qrdqn"], *NO_FILES)
+    (tmp_path / "sb3_contrib.py").write_text("raise RuntimeError('imported')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [])
+    for name in [name for name in sys.modules if name.partition(".")[0] == "sb3_contrib"]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(InputError, match="needs sb3-contrib"):
+        SavedRun(tmp_path / "run").snapshot()
 
 
 def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
