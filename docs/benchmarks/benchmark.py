@@ -51,8 +51,9 @@ def _parser() -> argparse.ArgumentParser:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     option = parser.add_argument
+    only = f"only these tables: {', '.join(_TABLES)}"
     option("--quick", action="store_true", help="one short repetition of everything, which takes minutes")
-    option("--only", choices=list(_TABLES), nargs="+", default=list(_TABLES), help="only these tables")
+    option("--only", choices=list(_TABLES), nargs="+", metavar="TABLE", default=list(_TABLES), help=only)
     option("--out", type=Path, default=Path("runs/benchmark.json"), help="the JSON file to write")
     return parser
 

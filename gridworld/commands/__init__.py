@@ -9,14 +9,16 @@ import argparse
 import difflib
 import math
 import re
+import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 
 from gridworld.base.bounds import Bounds, digits
-from gridworld.base.console import CONSOLE, prepare, printing, program, tell_error
+from gridworld.base.console import CONSOLE, as_called, prepare, printing, program, tell_error
 from gridworld.base.errors import DISTRIBUTION, EXIT_CODE, InputError, failure
 from gridworld.base.signals import Interrupted, at_work
 
@@ -47,6 +49,7 @@ Commands:
 {commands}
 
 Help for a command: {console} COMMAND --help
+
 Version: {console} --version
 
 Examples:
@@ -54,11 +57,12 @@ Examples:
   {console} evaluate runs/...
   {console} train -m agent=dqn,ppo "seed=range(20)" hydra.sweep.dir=runs/mine
   {console} report runs/mine"""
+_WIDEST = 112  # columns of a help text
 _BEST = "use the model with the lowest exact regret, not the last one"
 _TRUST = "import the classes that the run names, from any package, and let its environment draw"
 _POLICY = "the best action, or the distribution that it explores with"
 _SHARED: dict[str, dict[str, Any]] = {  # arguments that several commands have
-    "run": {"type": Path, "help": "the run's folder, e.g. runs/2026-..."},
+    "run": {"type": Path, "metavar": "RUN", "help": "the run's folder, e.g. runs/2026-..."},
     "runs": {"type": Path, "nargs": "+", "metavar": "RUNS", "help": "folders, searched for runs"},
     "--policy": {"choices": ("greedy", "sampled"), "default": "greedy", "help": _POLICY},
     "--best": {"action": "store_true", "help": _BEST},
@@ -73,18 +77,46 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parser_of(
-    command: str, about: str | None, *shared: str, epilog: str | None = None
+    command: str, about: str | None, *shared: str, example: str = "", epilog: str = ""
 ) -> argparse.ArgumentParser:
-    """The parser of a command that has these of the `_SHARED` arguments."""
+    """The parser of a command that has these of the `_SHARED` arguments; its help ends with an `example`."""
+    if example:
+        epilog += f"\n\nExample:\n  python scripts/{command}.py {example}"
     parser = _Parser(
         prog=program(command),
-        description=about,
-        epilog=epilog,
+        description=folded(about or ""),
+        epilog=folded(epilog),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     for name in shared:
         parser.add_argument(name, **_SHARED[name])
     return parser
+
+
+def folded(text: str) -> str:
+    """A help text as wide as the terminal: paragraphs are filled, and what a table says hangs in its column.
+
+    Command lines, which are to be copied, stay whole.
+    """
+    width = min(shutil.get_terminal_size((_WIDEST, 0)).columns, _WIDEST) - 2
+    lines, shown = list[str](), list[str]()
+    for line in as_called(text).splitlines():
+        if lines and line[:1].strip() and lines[-1][:1].strip():  # of one paragraph
+            lines[-1] += f" {line}"
+        else:
+            lines.append(line)
+    for line in lines:
+        name, gap, meaning = re.fullmatch(r"( *(?:\S.*?(?=  |$))?)( *)(.*)", line).groups()  # type: ignore[union-attr]
+        hang = len(name + gap) if meaning else len(line) - len(line.lstrip())
+        if hang > width / 2:
+            shown.append(name)
+            line, hang = f"{'':8}{meaning}", 8
+        is_command = re.match(rf" +({CONSOLE}|python) ", line)
+        unbroken: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
+        shown.append(
+            line if is_command else textwrap.fill(line, width, subsequent_indent=" " * hang, **unbroken)
+        )
+    return "\n".join(shown)
 
 
 def whole(low: float = -math.inf, high: float = math.inf) -> Callable[[str], int]:
@@ -151,7 +183,7 @@ def _without_command(words: Sequence[str]) -> None:
     word = words[0] if words else "--help"
     if word in ("--help", "-h", "help"):
         commands = "\n".join(f"  {name:<12}{about}" for name, about in COMMANDS.items())
-        print(_MANUAL.format(console=CONSOLE, commands=commands))
+        print(folded(_MANUAL.format(console=CONSOLE, commands=commands)))
         return
     if word == "--version":
         from importlib.metadata import version

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import textwrap
 from collections.abc import Sequence
 
 from gridworld.base.console import printable
@@ -46,15 +45,12 @@ def main(words: Sequence[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    probes = "\n".join(
-        textwrap.fill(f"  {probe.name:<13}{probe.meaning}", 100, subsequent_indent=" " * 15)
-        for probe in PROBES
-    )
+    probes = "\n".join(f"  {probe.name:<13}{probe.meaning}" for probe in PROBES)
     epilog = f"The probes, and what a failure means:\n{probes}"
-    parser = parser_of("check", __doc__, epilog=epilog)
+    parser = parser_of("check", __doc__, example="my_agent:train --probe truncation", epilog=epilog)
     option = parser.add_argument
-    kinds = "my_agent:train, a function; my_package.MyPPO, a class like SB3's; or dqn, a shipped agent"
-    option("algorithm", help=kinds)
+    kinds = "my_agent:train, a function; my_agents:MyPPO, a class like SB3's; or dqn, a shipped agent"
+    option("algorithm", metavar="ALGORITHM", help=kinds)
     argument = "an argument for it, e.g. learning_rate=0.001; may be repeated"
     option("--set", action="append", default=[], metavar="NAME=VALUE", help=argument)
     option("--probe", action="append", default=[], metavar="NAME", help="only this probe; may be repeated")

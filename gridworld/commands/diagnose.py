@@ -101,7 +101,7 @@ def _is_any_certified(saved: SavedRun, found: Diagnosis, options: argparse.Names
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("diagnose", __doc__, "run", "--trust")
+    parser = parser_of("diagnose", __doc__, "run", "--trust", example="runs/mine --try")
     tried = "train the suggestions, in RUN-tried, until one is certified; exit code 1 if none is"
     parser.add_argument("--try", dest="try_offers", action="store_true", help=tried)
     return parser

@@ -61,7 +61,9 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("evaluate", __doc__, "run", "--policy", "--best", "--trust")
+    parser = parser_of(
+        "evaluate", __doc__, "run", "--policy", "--best", "--trust", example="runs/mine --policy sampled"
+    )
     option = parser.add_argument
     option("--layout", help="score on another map of the same size: a name or a file")
     option(

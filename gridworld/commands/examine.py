@@ -29,9 +29,13 @@ def main(words: Sequence[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("examine", __doc__)
+    parser = parser_of("examine", __doc__, example="my_env:Tiny --gamma 0.9")
     option = parser.add_argument
-    option("env", help="an id of Gymnasium, module:NAME of a class or function, or a world, e.g. cliff")
+    option(
+        "env",
+        metavar="WORLD",
+        help="an id of Gymnasium, module:NAME of a class or function, or a world, e.g. cliff",
+    )
     option("--gamma", type=float, default=0.99, help="the discount that an agent will have (default 0.99)")
     option("--steps", type=whole(100), default=20_000, help="how many steps to sample (default 20000)")
     option("--seed", type=whole(0), default=0, help="of all that is drawn (default 0)")

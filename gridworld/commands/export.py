@@ -74,7 +74,7 @@ def _export(folder: Path, to: str, out: Path, project: str) -> tuple[str, tuple[
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("export", __doc__, "runs")
+    parser = parser_of("export", __doc__, "runs", example="runs/mine --to hub")
     option = parser.add_argument
     option("--to", choices=tuple(TARGETS), required=True, help="all but hub need the extra of the same name")
     option("--out", type=Path, help="the folder to write to (default runs/export/TARGET)")

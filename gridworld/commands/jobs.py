@@ -7,8 +7,9 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from gridworld.base.console import aligned, printable, program, telling_if_slow
+from gridworld.base.console import aligned, printable, telling_if_slow
 from gridworld.base.user_input import limited
+from gridworld.commands import parser_of
 from gridworld.sweeps.console import counts_text
 from gridworld.sweeps.folder import STATUSES, JobRow, open_sweep
 from gridworld.world.metrics import regret_text
@@ -37,7 +38,8 @@ def _cells(row: JobRow) -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=program("jobs"), description=__doc__)
-    parser.add_argument("sweep", type=Path, help="the sweep's folder, e.g. runs/mine")
-    parser.add_argument("--status", choices=STATUSES, help="only jobs with this status")
+    parser = parser_of("jobs", __doc__, example="runs/mine --status failed")
+    parser.add_argument("sweep", type=Path, metavar="SWEEP", help="the sweep's folder, e.g. runs/mine")
+    only = f"only jobs with this status: {', '.join(STATUSES)}"
+    parser.add_argument("--status", choices=STATUSES, metavar="STATUS", help=only)
     return parser

@@ -5,10 +5,9 @@ Hydra's own help takes twice as long, since it loads every configuration to list
 
 from __future__ import annotations
 
-import textwrap
 from pathlib import Path
 
-from gridworld.base.console import as_called
+from gridworld.commands import folded
 from gridworld.config.words import conf_folder
 
 _TEXT = """\
@@ -47,6 +46,11 @@ Sweeps (-m):
   hydra/launcher=joblib  parallel jobs in new processes; on a cluster: slurm, ray
   hydra.sweeper.paired=[agent,n_envs]  these lists vary together instead of in every combination
 
+Next: scripts/evaluate.py, scripts/record.py and scripts/play.py --agent take a run's folder, scripts/jobs.py
+a sweep's. To find settings: scripts/tune.py.
+
+Hydra's own options: python scripts/train.py --hydra-help
+
 Examples:
   python scripts/train.py agent=q_learning
       a table over the states, trained in a second
@@ -58,10 +62,6 @@ Examples:
       resume an interrupted run
   python scripts/train.py recipe=runs/tune_ppo_maze seed=3
       train with the winner of a study
-
-Next: scripts/evaluate.py, scripts/record.py and scripts/play.py --agent take a run's folder, scripts/jobs.py
-a sweep's. To find settings: scripts/tune.py.
-Hydra's own options: python scripts/train.py --hydra-help
 """
 
 
@@ -73,7 +73,7 @@ def manual() -> str:
     for group in sorted({file.parent for file in conf.glob("**/*.yaml")} - hidden):
         lines.append(f"  {group.relative_to(conf).as_posix()}=...")
         lines += _recipes(group) if group.name == "tuned" else choices(group)
-    return as_called(_TEXT.format(choices="\n".join(lines)))
+    return folded(_TEXT.format(choices="\n".join(lines)))
 
 
 def choices(group: Path) -> list[str]:
@@ -93,8 +93,7 @@ def _recipes(group: Path) -> list[str]:
     files = sorted(group.glob("*/*.yaml"))
     for agent in sorted({file.parent.name for file in files}):
         names = [file.stem for file in files if file.parent.name == agent]
-        text = f"    {agent + '/...':<18}  {', '.join(names)}"
-        lines += textwrap.wrap(text, 100, subsequent_indent=" " * 24)
+        lines.append(f"    {agent + '/...':<18}  {', '.join(names)}")
     failing = [file for file in files if "known_failure:" in file.read_text("utf-8")]
     names = [file.relative_to(group).with_suffix("").as_posix() for file in failing]
     return [*lines, f"    Known to fail: {', '.join(names)}"]

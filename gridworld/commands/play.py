@@ -68,14 +68,15 @@ class Player:
         self._policy = policy
         self._env = GridWorldVectorEnv(max_episode_steps=limit, autoreset_mode="Disabled", mdp=evaluator.mdp)
         self.state = self.steps = 0
-        self.value = self.optimum = 0.0  # discounted return so far, and the best expected from the start
+        self.total = 0.0  # the return so far
+        self.value = self.optimum = 0.0  # the same, discounted, and the best expected from the start
         self.over = False
 
     def restart(self, seed: int) -> None:
         """Start an episode; players with the same seed start in the same state."""
         self.state = int(self._env.reset(seed=seed)[0][0])
         self._chance = independent_generator(seed)  # the world uses the seed's own generator
-        self.steps, self.value, self.over = 0, 0.0, False
+        self.steps, self.total, self.value, self.over = 0, 0.0, 0.0, False
         self.optimum = float(self.evaluator.solution.v[self.state])
         if self.real is not None:
             self.real.reset(self.state)
@@ -92,14 +93,16 @@ class Player:
             return
         states, rewards, terminated, truncated, _ = self._env.step(np.array([action]))
         self.state, self.over = int(states[0]), bool(terminated[0] or truncated[0])
+        self.total += float(rewards[0])
         self.value += self.evaluator.solution.gamma**self.steps * float(rewards[0])
         self.steps += 1
         if self.real is not None:
             self.real.follow(self.state, action)
 
     def standing(self) -> str:
-        """The player's name, steps and return, and the optimum."""
-        return f"{self.name}: {self._taken()}, return {self.value:.4g}, optimum {self.optimum:.4g}"
+        """The player's name, steps and return, also discounted, as the optimum is."""
+        result = f"return {self.total:.4g}, discounted {self.value:.4g}, optimum {self.optimum:.4g}"
+        return f"{self.name}: {self._taken()}, {result}"
 
     def verdict(self) -> str:
         """How the finished episode compares with the optimum."""
@@ -188,8 +191,9 @@ def draw(game: Game, cell_size: int) -> Frame:
         is_advised = game.shows_optimum and player.real is not None and not player.over
         advice = f"; optimal here: {' or '.join(names)}" if is_advised else ""
         board.caption(player.standing() + advice)
-        legend = game.legend() if player is game.person else ""
-        board.footer(player.verdict() if player.over else legend)
+        is_person = player is game.person
+        legend, again = (game.legend(), "; R: restart") if is_person else ("", "")
+        board.footer(player.verdict() + again if player.over else legend)
         boards.append(board.frame())
     return np.concatenate(boards, axis=1)
 
@@ -262,7 +266,7 @@ def play(game: Game, cell_size: int) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("play", __doc__, "--best", "--trust", "--config-dir")
+    parser = parser_of("play", __doc__, "--best", "--trust", "--config-dir", example="env=cliff env.slip=0.1")
     option = parser.add_argument
     option(
         "words",

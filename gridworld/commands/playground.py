@@ -47,7 +47,9 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("playground", __doc__, "--best", "--trust", "--config-dir")
+    parser = parser_of(
+        "playground", __doc__, "--best", "--trust", "--config-dir", example="cliff --out cliff.html"
+    )
     option = parser.add_argument
     option(
         "words",

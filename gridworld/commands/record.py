@@ -66,11 +66,14 @@ def _record(options: argparse.Namespace) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("record", __doc__, "run", "--policy", "--best", "--trust")
+    parser = parser_of(
+        "record", __doc__, "run", "--policy", "--best", "--trust", example="runs/mine --format gif policy"
+    )
     option = parser.add_argument
     kinds = f"any of {' '.join(files.FORMATS)} for episodes, {' '.join(MAPS)} for maps"
     kinds += " (default png gif; mp4 needs the extra `video`)"
-    option("--format", nargs="+", choices=(*files.FORMATS, *MAPS), default=["png", "gif"], help=kinds)
+    choices = (*files.FORMATS, *MAPS)
+    option("--format", nargs="+", metavar="FORMAT", choices=choices, default=["png", "gif"], help=kinds)
     option("--cell-size", type=whole(2), help="pixels (default 100, 80 in maps, less on large worlds)")
     option("--fps", type=whole(1, 100), default=4, help="frames per second, 1 to 100 (default 4)")
     option("--episodes", type=whole(1, 1000), default=1, help="number of episodes (default 1)")

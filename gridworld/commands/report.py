@@ -63,7 +63,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("report", __doc__, "runs")
+    parser = parser_of("report", __doc__, "runs", example="runs/mine --open")
     option = parser.add_argument
     option(
         "--out",

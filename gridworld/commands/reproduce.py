@@ -84,7 +84,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("reproduce", __doc__, "run", "--trust")
+    parser = parser_of("reproduce", __doc__, "run", "--trust", example="runs/mine --keep runs/again")
     kept = "write the new run to this folder, with its pictures, and keep it"
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help=kept)
     return parser

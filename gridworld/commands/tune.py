@@ -91,8 +91,8 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _parser(conf: Path) -> argparse.ArgumentParser:
-    about = as_called(__doc__ or "").format(spaces="\n".join(choices(conf / "tune")))
-    parser = parser_of("tune", about, "--config-dir", epilog=as_called(_EPILOG))
+    about = (__doc__ or "").format(spaces="\n".join(choices(conf / "tune")))
+    parser = parser_of("tune", about, "--config-dir", epilog=_EPILOG)
     option = parser.add_argument
     option("overrides", nargs="*", metavar="key=value", help=as_called("settings of train.py and tune.*"))
     option(

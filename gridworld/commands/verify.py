@@ -73,7 +73,9 @@ def _verified(folder: Path, options: argparse.Namespace) -> tuple[Verified, bool
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_of("verify", __doc__, "runs", "--best", "--trust")
+    parser = parser_of(
+        "verify", __doc__, "runs", "--best", "--trust", example="runs/mine --out certificate.json"
+    )
     out = "a file for the certificate of the only run, JSON; compressed if it ends with .gz"
     parser.add_argument("--out", type=Path, metavar="FILE", help=out)
     return parser

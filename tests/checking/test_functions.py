@@ -236,7 +236,9 @@ def test_a_function_in_a_file_is_found_by_other_processes_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where a module of Python's has the file's name."""
-    (tmp_path / "random.py").write_text("def train(env, total_timesteps, seed):\n    return lambda state: 1\n")
+    (tmp_path / "random.py").write_text(
+        "def train(env, total_timesteps, seed):\n    return lambda state: 1\n"
+    )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     result = gridworld.check("random.py:train", probes=["choice", "delay"], processes=2)

@@ -1,5 +1,6 @@
 """The console command `gridworld`, in the checkout and from a wheel; what both tell people to type."""
 
+import contextlib
 import json
 import os
 import re
@@ -10,6 +11,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from helpers.pages import check
 from helpers.support import CONF, ROOT, SHORT
 
 from gridworld import __version__
@@ -63,6 +65,24 @@ def test_help_version_and_words_that_are_no_command(
         out, errors = told(word, code=2)
         shown = word.replace("\x1b", "\\x1b")
         assert (out, errors) == ("", f"error: gridworld: unknown command {shown}; {advice}\n")
+
+
+@pytest.mark.parametrize("name", [*COMMANDS, ""])
+def test_help_fits_a_narrow_terminal_and_ends_with_an_example(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["gridworld", *name.split(), "--help"])
+    monkeypatch.setenv("COLUMNS", "60")
+    with contextlib.suppress(SystemExit):
+        main()
+    lines = capsys.readouterr().out.splitlines()
+    examples = [line for line in lines if line.startswith("  gridworld ")]  # to be copied, so they stay whole
+    assert [line for line in lines if len(line) > 60 and line not in examples] == []
+    assert lines.index(examples[-1]) >= len(lines) - 3  # what it does may follow
+    check(examples[-1].strip())
+    _, _, positional = "\n".join(lines).partition("\npositional arguments:\n")
+    shown = positional.partition("\n\n")[0].splitlines()
+    assert all(re.match(r"  ([A-Z]+|env=NAME|key=value)  | {4}", line) for line in shown)
 
 
 def test_the_help_of_train_needs_no_numbers() -> None:

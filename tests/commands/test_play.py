@@ -14,6 +14,7 @@ from gridworld.commands.play import Game, Player, draw
 from gridworld.config.worlds import EnumeratedConfig, GymnasiumConfig
 from gridworld.envs.rendering import AGENT, draw_frame
 from gridworld.visualization.episode import RealEnv
+from gridworld.visualization.sheet import Sheet
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
@@ -32,10 +33,11 @@ def moved(game: Game, *actions: int) -> Game:
 def test_keys_are_the_actions_and_returns_are_discounted() -> None:
     game = moved(Game(CLASSIC), RIGHT, DOWN, LEFT, UP, UP)
     assert (game.person.state, game.person.steps, game.person.value, game.over) == (0, 5, 0, False)
-    assert game.person.standing() == "you: 5 steps, return 0, optimum 0.9321"
+    assert game.person.standing() == "you: 5 steps, return 0, discounted 0, optimum 0.9321"
     game = moved(Game(CLASSIC), *SHORTEST)
     assert game.over
-    assert game.person.value == pytest.approx(0.99**7)
+    assert (game.person.total, game.person.value) == (1, pytest.approx(0.99**7))
+    assert game.person.standing() == "you: 8 steps, return 1, discounted 0.9321, optimum 0.9321"
     moved(game, UP, RIGHT)  # it is over
     assert game.person.verdict() == "goal after 8 steps: nobody could do better"
     game = moved(Game(CLASSIC), UP, *SHORTEST)
@@ -44,6 +46,15 @@ def test_keys_are_the_actions_and_returns_are_discounted() -> None:
     assert game.person.verdict().startswith("trap after 5 steps: 1.893 less than the optimum")
     game.restart()
     assert (game.person.state, game.person.steps, game.person.value, game.over) == (0, 0, 0, False)
+
+
+def test_an_episode_that_is_over_says_how_to_start_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[str] = []
+    monkeypatch.setattr(Sheet, "footer", lambda sheet, text: written.append(text))
+    agent = Player(CLASSIC, "dqn", CLASSIC.optimal_policy(), 100)
+    draw(moved(Game(CLASSIC, 0, agent), *SHORTEST), 60)
+    verdict = "goal after 8 steps: nobody could do better"
+    assert written == [f"{verdict}; R: restart", verdict]
 
 
 def test_the_agent_keeps_step_and_walks_on_alone_until_it_gives_up() -> None:
@@ -182,7 +193,8 @@ def test_the_window_obeys_the_keyboard(
     command.main(["--cell-size", "30"])
     assert not names
     assert capsys.readouterr().out == (
-        "you: 8 steps, return 0.9321, optimum 0.9321; goal after 8 steps: nobody could do better\n"
+        "you: 8 steps, return 1, discounted 0.9321, optimum 0.9321; "
+        "goal after 8 steps: nobody could do better\n"
     )
     agent = [(frame == AGENT).all(axis=2) for frame in shown]
     assert np.array_equal(agent[0], agent[-1])  # back at the start
