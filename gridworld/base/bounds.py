@@ -31,7 +31,7 @@ class Bounds:
 
     def check(self, key: str, number: float, written: object = None) -> None:
         """Refuse a number outside; `written` is how the setting has it."""
-        if not isinstance(number, Real):
+        if not isinstance(number, Real) or isinstance(number, bool):
             raise InputError(f"{key}={str(number)[:50]}: must be a number, {self}")
         is_high_enough = self.low < number if self.above else self.low <= number
         is_large_enough = number == 0 or abs(number) >= self.least
@@ -49,6 +49,17 @@ class Bounds:
         if self.high == math.inf:
             return low
         return f"{low} and at most {self.high}" if self.above else f"from {self.low} to {self.high}"
+
+
+@dataclass(frozen=True)
+class Rate(Bounds):
+    """The same of a rate, from 0: of a number that may fall over training (`parse_schedule`)."""
+
+    low: float = 0
+    linear_only: bool = False
+
+    def check(self, key: str, number: Any, written: object = None) -> None:
+        super().check(key, parse_schedule(key, number, self.linear_only).initial, number)
 
 
 @dataclass(frozen=True)
@@ -78,7 +89,7 @@ def parse_schedule(key: str, value: int | float | str, linear_only: bool = False
         form = next((form for form in _POWERS if value.startswith(form)), "")
         digits = value.removeprefix(form) if form and "_" not in value.removeprefix(form) else "nan"
     try:
-        number = float(digits)
+        number = math.nan if isinstance(value, bool) else float(digits)
     except (ValueError, OverflowError):
         number = math.nan
     if not 0 <= number < math.inf or (linear_only and form not in ("", LINEAR)):

@@ -8,9 +8,8 @@ none either. A subclass with another default for a field need not repeat what it
 from __future__ import annotations
 
 import functools
-import math
 import re
-from dataclasses import field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum, IntEnum, auto
 from typing import Annotated, Any
 
@@ -19,7 +18,6 @@ from gridworld.base.user_input import LIBRARIES
 
 MISSING = "???"  # OmegaConf's sign for a value that has to be given
 MOST_KEPT = 10**9  # episodes that a mean is taken over
-EFFECTS, PRIVILEGE, BOUNDS, RATE = "effects", "privilege", "bounds", "rate"  # keys of a field's metadata
 
 _OF_LIBRARIES = rf"({'|'.join(map(re.escape, LIBRARIES))})[\w.]+"
 _OF_KEYWORD = r"[\w+-]*"
@@ -40,40 +38,29 @@ class Effect(Enum):
     NOTHING = auto()  # once the run has come to its end
 
 
-def setting(default: Any, *declared: dict[str, Any]) -> Any:
-    """A field of a schema, with metadata as below; `default` may be a class, which makes it."""
-    metadata = {key: value for part in declared for key, value in part.items()}
+@dataclass(frozen=True)
+class Privilege:
+    """What a run has by a setting with this `value`; None: with any that is not empty or 0."""
+
+    name: str
+    value: Any = None
+
+
+def setting(default: Any, *declared: object) -> Any:
+    """A field of a schema, and what it declares; `default` may be a class, which makes it.
+
+    That is an effect, those of single entries of a mapping, bounds of a number, a privilege, a picture.
+    """
+    metadata = {Bounds if isinstance(each, Bounds) else type(each): each for each in declared}
     if isinstance(default, type):
         return field(default_factory=default, metadata=metadata)
     return field(default=default, metadata=metadata)
 
 
-def affects(effect: Effect, **entries: Effect) -> dict[str, Any]:
-    """Metadata: the setting's effect, and that of single entries where it is a mapping."""
-    return {EFFECTS: {"": effect, **{f".{name}": other for name, other in entries.items()}}}
-
-
-def privilege(name: str, value: Any = None) -> dict[str, Any]:
-    """Metadata: with `value` (None: any that is not empty or 0), the run has a privilege of this name."""
-    return {PRIVILEGE: (name, value)}
-
-
-def bounds(
-    low: float = -math.inf, high: float = math.inf, above: bool = False, least: float = 0.0
-) -> dict[str, Any]:
-    """Metadata: the setting is a number within these `Bounds`, or null."""
-    return {BOUNDS: Bounds(low, high, above, least)}
-
-
-def rate(high: float = math.inf, above: bool = False, linear_only: bool = False) -> dict[str, Any]:
-    """Metadata: the same from 0, of a number that may fall over training (`parse_schedule`)."""
-    return bounds(0, high, above) | {RATE: linear_only}
-
-
 @functools.cache
-def declared(schema: type) -> dict[str, dict[str, Any]]:
-    """The metadata of each field, with what the base classes declare of it."""
-    found: dict[str, dict[str, Any]] = {}
+def declared(schema: type) -> dict[str, dict[type, Any]]:
+    """What each field declares, and what the base classes declare of it, by its type."""
+    found: dict[str, dict[type, Any]] = {}
     for kind in reversed(schema.__mro__):
         for each in fields(kind) if is_dataclass(kind) else ():
             found[each.name] = found.get(each.name, {}) | dict(each.metadata)

@@ -15,15 +15,14 @@ import re
 import types
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from gridworld.base.console import printable
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import LIBRARIES, users_folder
 from gridworld.config.fields import (
-    EFFECTS,
-    PRIVILEGE,
     Effect,
+    Privilege,
     Text,
     Use,
     WholeNumbers,
@@ -67,12 +66,12 @@ def flat(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield f"{prefix}{key}", value
 
 
-def _walk(schema: type, section: str = "") -> Iterator[tuple[str, Any, dict[str, Any]]]:
-    """(dotted name, type, metadata) of every field of a schema, its sections and their alternatives."""
+def _walk(schema: type, section: str = "") -> Iterator[tuple[str, Any, dict[type, Any]]]:
+    """(dotted name, type, what it declares) of every field of a schema and its sections, all alternatives."""
     hints = get_type_hints(schema, include_extras=True)
-    for name, metadata in declared(schema).items():
+    for name, found in declared(schema).items():
         hint = hints[name]
-        yield section + name, hint, metadata
+        yield section + name, hint, found
         if isinstance(hint, type) and dataclasses.is_dataclass(hint):
             others: Mapping[type, Mapping[str, type]] = {AgentConfig: agent_schemas(), EnvConfig: SOURCES}
             for each in (hint, *others.get(hint, {}).values()):
@@ -104,33 +103,24 @@ def all_settings() -> dict[str, Hints]:
 
 def takes_whole_numbers(name: str) -> bool:
     """Whether a setting of a run, a sweep or a search, or what contains it, consists of whole numbers."""
-    return name in _whole_numbers() or ("." in name and takes_whole_numbers(name.rpartition(".")[0]))
+    found = False
+    for hint in _at(name, all_settings(), ()):
+        kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+        if not (found := float not in kinds and (int in kinds or hint == WholeNumbers)):
+            break
+    return found
 
 
 @functools.cache
-def _whole_numbers() -> frozenset[str]:
-    def is_whole(hint: Any) -> bool:
-        kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
-        return float not in kinds and (int in kinds or hint == WholeNumbers)
-
-    return frozenset(name for name, hints in all_settings().items() if all(map(is_whole, hints)))
+def _declared(kind: type[T]) -> dict[str, T]:
+    """What is declared of this kind in the schemas of a run, by the dotted name of the field or section."""
+    return {name: found[kind] for name, _, found in _walk(TrainConfig) if kind in found}
 
 
 @functools.cache
 def _effects() -> dict[str, Effect]:
-    """Every effect that is declared, by the dotted name of its field, entry or section."""
-    return {
-        name + entry: effect
-        for name, _, metadata in _walk(TrainConfig)
-        for entry, effect in metadata.get(EFFECTS, {}).items()
-    }
-
-
-@functools.cache
-def _divided() -> frozenset[str]:
-    """The sections whose settings have not all the same effect, or are not all as old."""
-    names = {*_effects(), *NEWER}
-    return frozenset(name[:at] for name in names for at, sign in enumerate(name) if sign == ".")
+    entries = _declared(dict).items()
+    return _declared(Effect) | {f"{name}.{key}": effect for name, of in entries for key, effect in of.items()}
 
 
 def effect_of(name: str) -> Effect:
@@ -156,7 +146,7 @@ def with_effects(
     found = {}
     for key, value in settings.items():
         name = f"{section}{key}"
-        if name in _divided() and isinstance(value, dict) and value:
+        if isinstance(value, dict) and value:
             if part := with_effects(effects, value, f"{name}."):
                 found[key] = part
         elif effect_of(name) in effects and (value or name not in NEWER):
@@ -166,17 +156,12 @@ def with_effects(
 
 def privileges(settings: Mapping[str, Any]) -> list[str]:
     """The names of what a simulator allowed a run with these plain values, and a learner would not have."""
-    given, found = dict(flat(settings)), []
-    for name, (called, value) in _privileges().items():
-        if given.get(name) == value if value is not None else given.get(name):
-            found.append(called)
-    return list(dict.fromkeys(found))
-
-
-@functools.cache
-def _privileges() -> dict[str, tuple[str, Any]]:
-    found = _walk(TrainConfig)
-    return {name: metadata[PRIVILEGE] for name, _, metadata in found if PRIVILEGE in metadata}
+    given, found = dict(flat(settings)), dict[str, None]()
+    for name, privilege in _declared(Privilege).items():
+        value = given.get(name)
+        if value if privilege.value is None else value == privilege.value:
+            found[privilege.name] = None
+    return list(found)
 
 
 def check_foreign(settings: Mapping[str, Any], where: str, allow: str, use: Use = Use.COMPOSE) -> None:
@@ -192,8 +177,7 @@ def check_foreign(settings: Mapping[str, Any], where: str, allow: str, use: Use 
 def foreign(settings: Mapping[str, Any], use: Use = Use.COMPOSE) -> Iterator[tuple[str, Any, str]]:
     """Find what does harm if a stranger wrote it, however deep: (dotted name, value, what it does)."""
     for name, value in _leaves(settings, ""):
-        kinds = _at(name, texts(), frozenset([Text.UNKNOWN]))  # code where no schema knows
-        for kind in sorted(kinds, key=lambda kind: kind.name):
+        for kind in sorted(texts(name), key=lambda kind: kind.name):
             pattern, harm, begins = kind.value
             if use < begins:
                 continue
@@ -229,11 +213,10 @@ def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
         yield name, value
 
 
-@functools.cache
-def texts() -> dict[str, frozenset[Text]]:
-    """What the text of each setting of a run is; nothing for a number."""
-    found = settings_of_a_run().items()
-    return {name: frozenset(text for hint in hints for text in _texts_in(hint)) for name, hints in found}
+def texts(name: str) -> frozenset[Text]:
+    """What the text of a setting of a run is; nothing for a number, code where no schema knows."""
+    hints = _at(name, settings_of_a_run(), (Annotated[Any, Text.UNKNOWN],))
+    return frozenset(text for hint in hints for text in _texts_in(hint))
 
 
 def _texts_in(hint: Any) -> Iterator[Text]:

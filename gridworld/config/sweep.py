@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
-from gridworld.config.fields import MISSING, bounds, setting
+from gridworld.base.bounds import Bounds
+from gridworld.config.fields import MISSING, setting
 
 _MOST_RUNS = 10_000  # of one kind: seeds, finalists
 _MOST_LOOKS = 100_000  # at a seed's training
@@ -19,8 +20,8 @@ class SweepConfig:
     retry_failed: bool = False  # run again what failed
     extend: bool = False  # use the folder of a sweep that shares no job with this one
     max_jobs: int = 10_000  # more are refused as a mistake
-    params: dict[str, Any] = field(default_factory=dict)  # settings and their values, as on a command line
-    paired: list[Any] = field(default_factory=list)  # swept settings that vary together, or lists of such
+    params: dict[str, Any] = setting(dict)  # settings and their values, as on a command line
+    paired: list[Any] = setting(list)  # swept settings that vary together, or lists of such
     population: int | str | None = "auto"  # runs that train as one; 1: each alone
 
 
@@ -44,18 +45,18 @@ class SlurmConfig:
     """`hydra/launcher=slurm`; all but the first two are submitit's, by its names."""
 
     _target_: str = "gridworld.sweeps.launchers.slurm"
-    jobs_per_task: int = setting(1, bounds(1))
-    array_parallelism: int = setting(256, bounds(1))
-    timeout_min: int = setting(60, bounds(1))
-    signal_delay_s: int = setting(60, bounds(1))
-    cpus_per_task: int = setting(1, bounds(1))  # cores
+    jobs_per_task: int = setting(1, Bounds(1))
+    array_parallelism: int = setting(256, Bounds(1))
+    timeout_min: int = setting(60, Bounds(1))
+    signal_delay_s: int = setting(60, Bounds(1))
+    cpus_per_task: int = setting(1, Bounds(1))  # cores
     mem_gb: float | None = None
     partition: str | None = None  # of Slurm's, and so below; null: the default
     account: str | None = None  # that pays
     qos: str | None = None  # quality of service
     constraint: str | None = None  # features that a node must have
-    setup: list[str] = field(default_factory=list)
-    more: dict[str, Any] = field(default_factory=dict)
+    setup: list[str] = setting(list)
+    more: dict[str, Any] = setting(dict)
 
 
 @dataclass
@@ -63,8 +64,8 @@ class RayConfig:
     """`hydra/launcher=ray`."""
 
     _target_: str = "gridworld.sweeps.launchers.ray"
-    init: dict[str, Any] = field(default_factory=dict)
-    remote: dict[str, Any] = field(default_factory=dict)
+    init: dict[str, Any] = setting(dict)
+    remote: dict[str, Any] = setting(dict)
 
 
 LAUNCHER_SCHEMAS = {"forks": ForksConfig, "joblib": JoblibConfig, "slurm": SlurmConfig, "ray": RayConfig}
@@ -86,31 +87,31 @@ class DimensionConfig:
 class TuneConfig:
     """How `scripts/tune.py` searches; `tune` on the command line."""
 
-    trials: int = setting(100, bounds(1))  # the search ends after so many
-    seeds: int = setting(3, bounds(1, _MOST_RUNS))  # a trial's: seed, seed + 1, ...
+    trials: int = setting(100, Bounds(1))  # the search ends after so many
+    seeds: int = setting(3, Bounds(1, _MOST_RUNS))  # a trial's: seed, seed + 1, ...
     # trials that run on more seeds, together with the baseline
-    finalists: int = setting(5, bounds(1, _MOST_RUNS))
-    final_seeds: int = setting(10, bounds(0, _MOST_RUNS))  # the next ones, for the finalists
+    finalists: int = setting(5, Bounds(1, _MOST_RUNS))
+    final_seeds: int = setting(10, Bounds(0, _MOST_RUNS))  # the next ones, for the finalists
     # the next ones, for the winner and the baseline
-    confirm_seeds: int = setting(20, bounds(2, _MOST_RUNS))
+    confirm_seeds: int = setting(20, Bounds(2, _MOST_RUNS))
     study: str | None = None  # its name; null: of agent and world
     folder: str | None = None  # null: runs/STUDY
     storage: str | None = None  # any URL that Optuna takes; null: study.db in the folder
-    workers: int = setting(-1, bounds(-1))  # processes; -1: one per core
-    together: int | None = setting(None, bounds(1))  # trials of a worker at once; null: 8 of all, 1 of one
-    timeout: float | None = setting(None, bounds(0, above=True))  # seconds; no trial starts after that
+    workers: int = setting(-1, Bounds(-1))  # processes; -1: one per core
+    together: int | None = setting(None, Bounds(1))  # trials of a worker at once; null: 8 of all, 1 of one
+    timeout: float | None = setting(None, Bounds(0, above=True))  # seconds; no trial starts after that
     sampler: str = "tpe"  # or random
-    sampler_seed: int = setting(0, bounds(0))  # of the search itself
+    sampler_seed: int = setting(0, Bounds(0))  # of the search itself
     pruner: str = "median"  # or hyperband, none
     # per seed, at least, to resolve which trial is certified sooner
-    evaluations: int = setting(50, bounds(1, _MOST_LOOKS))
-    reports: int = setting(10, bounds(1, _MOST_LOOKS))  # pruner's looks at a seed's curve
-    stop_after: int | None = setting(3, bounds(1))  # a trial's seed ends at this many certificates in a row
-    space: dict[str, DimensionConfig] = field(default_factory=dict)  # conf/tune/*.yaml
+    evaluations: int = setting(50, Bounds(1, _MOST_LOOKS))
+    reports: int = setting(10, Bounds(1, _MOST_LOOKS))  # pruner's looks at a seed's curve
+    stop_after: int | None = setting(3, Bounds(1))  # a trial's seed ends at this many certificates in a row
+    space: dict[str, DimensionConfig] = setting(dict)  # conf/tune/*.yaml
 
 
 @dataclass
 class SearchConfig:
     """The root of conf/tune.yaml."""
 
-    tune: TuneConfig = field(default_factory=TuneConfig)
+    tune: TuneConfig = setting(TuneConfig)

@@ -12,25 +12,21 @@ report's page read the table `PICTURES`. To add one, add a field to `RecordingCo
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gridworld.base.bounds import LARGEST_INTEGER, MOST_ENVS, discount, parse_schedule
+from gridworld.base.bounds import LARGEST_INTEGER, MOST_ENVS, Bounds, discount
 from gridworld.base.errors import InputError
 from gridworld.config.fields import (
-    BOUNDS,
     MISSING,
-    RATE,
     Callback,
     ClassPath,
     Contact,
     Effect,
+    Privilege,
     Word,
-    affects,
-    bounds,
     declared,
-    privilege,
     setting,
 )
 from gridworld.config.worlds import SOURCES, EnvConfig, MapConfig
@@ -38,7 +34,6 @@ from gridworld.config.worlds import SOURCES, EnvConfig, MapConfig
 MOST_BONUS = 10**6  # of exploration; any reward beside it would be lost in the numbers of a network
 MOST_THREADS = 1024
 AUTO = "auto"  # checkpoints as often as they cost next to nothing
-_PICTURE = "picture"  # in a field's metadata
 
 
 @dataclass
@@ -48,7 +43,7 @@ class AgentConfig:
     They are in its package in `gridworld.agents`, and are read without what an agent needs to learn.
     """
 
-    name: Word = setting(MISSING, affects(Effect.LABELS))  # in tables and folders
+    name: Word = setting(MISSING, Effect.LABELS)  # in tables and folders
     family: Word = MISSING  # the package in `gridworld.agents`
     algorithm: ClassPath = MISSING  # the class, by its import path where it is none of ours
     known_by = ""  # a setting that only its classes have; "": `algorithm` can be no class derived from it
@@ -100,7 +95,7 @@ class ObservationConfig:
     """What the agent sees of a state."""
 
     kind: Word = "one_hot"  # or coordinates, image, own, none (the state's number)
-    cell_size: int = setting(8, bounds(1))  # pixels, for images
+    cell_size: int = setting(8, Bounds(1))  # pixels, for images
     # features extractor of an `MlpPolicy` whose settings name none; null: Stable-Baselines3's own
     features: ClassPath | None = None
 
@@ -116,10 +111,10 @@ class ObservationConfig:
 class EvaluationConfig:
     """The exact evaluation."""
 
-    every: int = setting(1000, bounds(1))  # environment steps
+    every: int = setting(1000, Bounds(1))  # environment steps
     # discount of value and regret, whatever discount the agent learns with
-    gamma: float = setting(0.99, affects(Effect.TASK))
-    stop_after: int | None = setting(None, bounds(1))  # end training at this many certificates in a row
+    gamma: float = setting(0.99, Effect.TASK)
+    stop_after: int | None = setting(None, Bounds(1))  # end training at this many certificates in a row
 
 
 @dataclass
@@ -128,10 +123,10 @@ class LoggingConfig:
 
     tensorboard: bool = True  # write an event file
     # evaluations between two pictures of the policy; 0 for none
-    policy_map_every: int = setting(5, bounds(0))
-    progress: bool = setting(True, affects(Effect.NOTHING))
+    policy_map_every: int = setting(5, Bounds(0))
+    progress: bool = setting(True, Effect.NOTHING)
     # log the scalars to W&B as well, while it trains
-    wandb: Contact = setting(False, affects(Effect.NOTHING))
+    wandb: Contact = setting(False, Effect.NOTHING)
 
 
 @dataclass(frozen=True)
@@ -170,30 +165,26 @@ class RecordingConfig:
     """Pictures in the run's folder; TensorBoard gets them too."""
 
     # values and greedy actions
-    policy_map: bool = setting(
-        True, {_PICTURE: Picture("policy.png", "maps.policy", "policy", while_training=True)}
-    )
+    policy_map: bool = setting(True, Picture("policy.png", "maps.policy", "policy", while_training=True))
     # how far the values are from the true ones
-    q_error: bool = setting(True, {_PICTURE: Picture("q_error.png", "maps.q_error", "error of its values")})
+    q_error: bool = setting(True, Picture("q_error.png", "maps.q_error", "error of its values"))
     # where training has been
-    visits: bool = setting(True, {_PICTURE: Picture("visits.png", "maps.visits", "visits while it learned")})
+    visits: bool = setting(True, Picture("visits.png", "maps.visits", "visits while it learned"))
     # the policy over training
-    learning: bool = setting(
-        True, {_PICTURE: Picture("learning.gif", "maps.learning", "policy while it learned")}
-    )
+    learning: bool = setting(True, Picture("learning.gif", "maps.learning", "policy while it learned"))
     # the final greedy policy's episode; MP4 needs the extra `video`
-    frames: bool = setting(True, {_PICTURE: Picture("frames", "episode.episode")})
-    gif: bool = setting(True, {_PICTURE: Picture("episode.gif", "episode.episode")})
-    mp4: bool = setting(False, {_PICTURE: Picture("episode.mp4", "episode.episode")})
+    frames: bool = setting(True, Picture("frames", "episode.episode"))
+    gif: bool = setting(True, Picture("episode.gif", "episode.episode"))
+    mp4: bool = setting(False, Picture("episode.mp4", "episode.episode"))
     # pixels of a cell of the episode and of learning.gif; null: what fits
-    cell_size: int | None = setting(None, bounds(2))
-    fps: int = setting(4, bounds(1, 100))  # frames a second
+    cell_size: int | None = setting(None, Bounds(2))
+    fps: int = setting(4, Bounds(1, 100))  # frames a second
 
 
 PICTURES: tuple[Picture, ...] = tuple(
-    replace(each.metadata[_PICTURE], setting=each.name)
-    for each in fields(RecordingConfig)
-    if _PICTURE in each.metadata
+    replace(found[Picture], setting=name)
+    for name, found in declared(RecordingConfig).items()
+    if Picture in found
 )
 
 
@@ -209,29 +200,29 @@ class TrainConfig:
     """One training run."""
 
     # the agent, or its recipe that went into this: AGENT/NAME, a file in conf/tuned (`config.recipes`)
-    recipe: Word | None = setting(None, affects(Effect.NOTHING))
+    recipe: Word | None = setting(None, Effect.NOTHING)
     # what came of these settings when they were tried, where they do not solve the task
-    known_failure: Word | None = setting(None, affects(Effect.NOTHING))
-    seed: int = setting(0, affects(Effect.SEED), bounds(0, 2**32 - 1))  # of all random numbers
-    total_timesteps: int = setting(20_000, affects(Effect.LENGTH), bounds(1))  # environment steps
-    n_envs: int = setting(64, bounds(1, MOST_ENVS))  # environments that step together
+    known_failure: Word | None = setting(None, Effect.NOTHING)
+    seed: int = setting(0, Effect.SEED, Bounds(0, 2**32 - 1))  # of all random numbers
+    total_timesteps: int = setting(20_000, Effect.LENGTH, Bounds(1))  # environment steps
+    n_envs: int = setting(64, Bounds(1, MOST_ENVS))  # environments that step together
     # b of b / sqrt(N), added to a reward of training for an action that was taken there N times; 0 for none
-    exploration_bonus: float = setting(0.0, bounds(0, MOST_BONUS))
+    exploration_bonus: float = setting(0.0, Bounds(0, MOST_BONUS))
     # share of training episodes that begin in a state drawn uniformly
-    exploring_starts: float = setting(0.0, privilege("starts anywhere"), bounds(0, 1))
+    exploring_starts: float = setting(0.0, Privilege("starts anywhere"), Bounds(0, 1))
     # whether environments in one state share out an action's outcomes evenly, see `gridworld.envs.vector_env`
-    stratified_draws: bool = setting(False, privilege("stratified draws"))
-    device: Word = setting("cpu", affects(Effect.MACHINE))
-    threads: int = setting(1, affects(Effect.MACHINE), bounds(1, MOST_THREADS))  # of torch
+    stratified_draws: bool = setting(False, Privilege("stratified draws"))
+    device: Word = setting("cpu", Effect.MACHINE)
+    threads: int = setting(1, Effect.MACHINE, Bounds(1, MOST_THREADS))  # of torch
     # of SB3: each a mapping of `_target_`, the import path of a class, and its arguments
-    callbacks: list[Callback] = field(default_factory=list)
+    callbacks: list[Callback] = setting(list)
     agent: AgentConfig = setting(AgentConfig)  # the chosen agent's own schema in its place
-    env: EnvConfig = setting(MapConfig, affects(Effect.TASK))  # of the chosen source (`config.worlds`)
+    env: EnvConfig = setting(MapConfig, Effect.TASK)  # of the chosen source (`config.worlds`)
     observation: ObservationConfig = setting(ObservationConfig)
-    evaluation: EvaluationConfig = setting(EvaluationConfig, affects(Effect.EVALUATION))
-    logging: LoggingConfig = setting(LoggingConfig, affects(Effect.FILES))
-    recording: RecordingConfig = setting(RecordingConfig, affects(Effect.FILES))
-    checkpoint: CheckpointConfig = setting(CheckpointConfig, affects(Effect.NOTHING))
+    evaluation: EvaluationConfig = setting(EvaluationConfig, Effect.EVALUATION)
+    logging: LoggingConfig = setting(LoggingConfig, Effect.FILES)
+    recording: RecordingConfig = setting(RecordingConfig, Effect.FILES)
+    checkpoint: CheckpointConfig = setting(CheckpointConfig, Effect.NOTHING)
 
 
 def check(config: TrainConfig) -> None:
@@ -251,11 +242,9 @@ def check(config: TrainConfig) -> None:
 def check_bounds(section: Any, prefix: str = "") -> None:
     """Check the numbers of a section of the settings, and of those in it, against their fields' bounds."""
     schema: type = type(section)
-    for name, metadata in declared(schema).items():
+    for name, found in declared(schema).items():
         key, value = prefix + name, getattr(section, name)
         if is_dataclass(value):
             check_bounds(value, f"{key}.")
-        elif BOUNDS in metadata and value is not None:
-            is_rate = RATE in metadata
-            number = parse_schedule(key, value, metadata[RATE]).initial if is_rate else value
-            metadata[BOUNDS].check(key, number, value)
+        elif Bounds in found and value is not None:
+            found[Bounds].check(key, value)

@@ -10,11 +10,11 @@ import functools
 import re
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gridworld.base.bounds import MOST_STEPS, STEP_LIMIT
+from gridworld.base.bounds import MOST_STEPS, STEP_LIMIT, Bounds
 from gridworld.base.errors import InputError
 from gridworld.config.fields import (
     MISSING,
@@ -26,8 +26,6 @@ from gridworld.config.fields import (
     Kwargs,
     Rewards,
     Word,
-    affects,
-    bounds,
     setting,
 )
 from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES
@@ -43,9 +41,9 @@ class EnvConfig:
     """A world of any source."""
 
     # the step limit; null: the world's own, or 100
-    max_episode_steps: int | None = setting(None, bounds(1, MOST_STEPS))
+    max_episode_steps: int | None = setting(None, Bounds(1, MOST_STEPS))
     # worlds of conf/env whose recipes are used where an agent has none of its own for this one
-    recipes_of: list[ChoiceName] = setting(list, affects(Effect.NOTHING))
+    recipes_of: list[ChoiceName] = setting(list, Effect.NOTHING)
 
     @property
     def name(self) -> str:
@@ -80,7 +78,7 @@ class MapConfig(EnvConfig):
     trap_reward: float = -1.0  # for entering a trap, which ends it too, or a cliff, which does not
     max_episode_steps: int | None = 100  # the step limit: then the episode is cut
     # of ends with letters of their own, as {A: 10, B: -1}, in place of those in the map
-    rewards: Rewards = field(default_factory=dict)
+    rewards: Rewards = setting(dict)
 
     @property
     def name(self) -> str:
@@ -106,13 +104,13 @@ class GymnasiumConfig(EnvConfig):
     source: Word = "gymnasium"
     # that it is registered under, e.g. FrozenLake-v1; or module:NAME of a class or a function that makes one
     id: EnvId = MISSING
-    kwargs: Kwargs = field(default_factory=dict)  # of gymnasium.make, the class or the function
+    kwargs: Kwargs = setting(dict)  # of gymnasium.make, the class or the function
     # attributes that are not part of its state, by your word
-    ignore: list[Word] = field(default_factory=list)
+    ignore: list[Word] = setting(list)
     # a search that finds more states is refused
-    most_states: int = setting(MOST_STATES, affects(Effect.NOTHING), bounds(1, 512 * 512))
+    most_states: int = setting(MOST_STATES, Effect.NOTHING, Bounds(1, 512 * 512))
     # a search that takes longer is refused
-    most_seconds: float = setting(MOST_SECONDS, affects(Effect.NOTHING), bounds(0, 86_400, above=True))
+    most_seconds: float = setting(MOST_SECONDS, Effect.NOTHING, Bounds(0, 86_400, above=True))
 
     @property
     def name(self) -> str:
@@ -174,7 +172,7 @@ class BuiltConfig(EnvConfig):
 
     source: Word = "built"
     builder: BuilderPath = MISSING  # the function's import path
-    kwargs: Kwargs = field(default_factory=dict)  # of the function
+    kwargs: Kwargs = setting(dict)  # of the function
 
     @property
     def name(self) -> str:

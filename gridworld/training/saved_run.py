@@ -184,7 +184,7 @@ def words_again(
     settings, moved, given = dataclasses.asdict(config), dict[str, str](), set[str]()
     for name, value in settings["env"].items():
         place = path_from_here(value, called_from)
-        if Text.FILE in texts().get(f"env.{name}", ()) and place != value and value not in shipped_layouts():
+        if Text.FILE in texts(f"env.{name}") and place != value and value not in shipped_layouts():
             moved[f"env.{name}"] = settings["env"][name] = place
     for word in words:
         found = _OVERRIDE.fullmatch(word)

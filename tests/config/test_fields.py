@@ -10,10 +10,10 @@ import pytest
 from cases import table
 from helpers.support import CONF, NO_FILES, configure, train_in
 
-from gridworld.base.bounds import Bounds
+from gridworld.base.bounds import Bounds, Rate
 from gridworld.base.errors import InputError
 from gridworld.commands.report import main as report
-from gridworld.config.fields import BOUNDS, RATE, Text, declared
+from gridworld.config.fields import Text, declared
 from gridworld.config.recipe_file import with_recipe
 from gridworld.config.settings import agent_schemas, foreign, privileges, settings_of_a_run
 from gridworld.config.sweep import TuneConfig
@@ -24,10 +24,10 @@ from gridworld.run.summary import summary_text
 SECTIONS = (TrainConfig, TuneConfig, *agent_schemas().values(), *SOURCES.values())
 SECTIONS += tuple(type(each) for each in vars(TrainConfig()).values() if dataclasses.is_dataclass(each))
 BOUNDED = [
-    (schema, name, metadata[BOUNDS], RATE in metadata)
+    (schema, name, found[Bounds], isinstance(found[Bounds], Rate))
     for schema in SECTIONS
-    for name, metadata in declared(schema).items()
-    if BOUNDS in metadata
+    for name, found in declared(schema).items()
+    if Bounds in found
 ]
 AGENTS = sorted(file.stem for file in (CONF / "agent").glob("*.yaml"))
 PLANS = "plans with the tables"

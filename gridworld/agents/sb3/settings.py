@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, Optional
 
-from gridworld.base.bounds import MOST_STEPS, Bounds, Decay, falls, parse_schedule
+from gridworld.base.bounds import MOST_STEPS, Bounds, Decay, Rate, falls, parse_schedule
 from gridworld.base.errors import InputError
 from gridworld.config.fields import (
-    BOUNDS,
     MOST_KEPT,
     Arguments,
     ClassPath,
@@ -19,10 +18,8 @@ from gridworld.config.fields import (
     Schedule,
     WholeNumbers,
     Word,
-    affects,
-    bounds,
     declared,
-    rate,
+    setting,
 )
 from gridworld.config.train import AgentConfig, TrainConfig
 
@@ -44,7 +41,7 @@ _BYTES_OF_A_STEP = 64  # in a buffer, and while it is summed up
 _CNN_FEATURES = 512  # of the last layer of SB3's NatureCNN
 _MOST_RETURN = 1e15  # of an episode
 _LEAST_REWARD = 1e-30  # in networks' 32 bits
-_COUNT, _SHARE, _POSITIVE = bounds(1), bounds(0, 1), bounds(0, above=True)
+_COUNT, _SHARE, _POSITIVE = Bounds(1), Bounds(0, 1), Bounds(0, above=True)
 
 
 @dataclass
@@ -54,10 +51,10 @@ class PolicyKwargs:
     net_arch: WholeNumbers = None  # layer widths, [64, 64]
     activation_fn: Optional[ClassPath] = None  # noqa: UP045
     features_extractor_class: Optional[ClassPath] = None  # noqa: UP045
-    features_extractor_kwargs: Arguments = field(default_factory=dict)
+    features_extractor_kwargs: Arguments = setting(dict)
     normalize_images: Optional[bool] = None  # noqa: UP045
     optimizer_class: Optional[ClassPath] = None  # noqa: UP045
-    optimizer_kwargs: Arguments = field(default_factory=dict)
+    optimizer_kwargs: Arguments = setting(dict)
 
     def __post_init__(self) -> None:
         given = self.optimizer_kwargs
@@ -92,7 +89,7 @@ class SB3Config(AgentConfig):
 
     family: Word = "sb3"
     # of SB3's learn(): episodes for DQN, iterations for PPO
-    log_interval: int = field(default=1, metadata=affects(Effect.LABELS) | bounds(1))
+    log_interval: int = setting(1, Effect.LABELS, Bounds(1))
     policy: ClassPath = "MlpPolicy"
     # the network runs once per state, where there is such a version; stock: SB3's own loop, once per sample
     engine: Word = "tabulated"
@@ -213,9 +210,8 @@ class SB3ClassConfig(SB3Config):
 
     known_by = "arguments"
 
-    arguments: Arguments = field(  # of the class; it keeps its defaults
-        default_factory=dict, metadata=affects(Effect.LEARNING, stats_window_size=Effect.LABELS)
-    )
+    # of the class, which keeps its defaults
+    arguments: Arguments = setting(dict, {"stats_window_size": Effect.LABELS})
 
     @property
     def where(self) -> str:
@@ -236,15 +232,11 @@ class SB3ClassConfig(SB3Config):
     def check(self, run: TrainConfig) -> None:
         super().check(run)
         for name, value in self.arguments.items():
-            key, number = f"agent.arguments.{name}", value
+            key = f"agent.arguments.{name}"
             if name in ("policy", "env", "seed", "device"):
                 raise InputError(f"{key}: is a setting of the run, not an argument of the class")
-            if name in (*FALLING, *SCHEDULES) and falls(value):
-                number = parse_schedule(key, value).initial
             if name in _BOUNDS and value is not None:
-                if isinstance(number, bool) or not isinstance(number, int | float):
-                    raise InputError(f"{key}={value}: must be a number")
-                _BOUNDS[name].check(key, number, value)
+                _BOUNDS[name].check(key, value)
 
 
 @dataclass
@@ -252,11 +244,11 @@ class SB3CheckedConfig(SB3Config):
     """A class of Stable-Baselines3 whose arguments are fields here, with their types."""
 
     # a number; lin_NUMBER, sqrt_NUMBER and quad_NUMBER fall to 0
-    learning_rate: Schedule = field(default=1e-3, metadata=rate())
-    batch_size: int = field(default=64, metadata=_COUNT)
-    gamma: float = field(default=0.99, metadata=_SHARE)
-    stats_window_size: int = field(default=100, metadata=affects(Effect.LABELS) | bounds(1, MOST_KEPT))
-    policy_kwargs: PolicyKwargs = field(default_factory=PolicyKwargs)
+    learning_rate: Schedule = setting(1e-3, Rate())
+    batch_size: int = setting(64, _COUNT)
+    gamma: float = setting(0.99, _SHARE)
+    stats_window_size: int = setting(100, Effect.LABELS, Bounds(1, MOST_KEPT))
+    policy_kwargs: PolicyKwargs = setting(PolicyKwargs)
 
 
 @dataclass
@@ -269,22 +261,22 @@ class DQNConfig(SB3CheckedConfig):
     log_interval: int = 4
     learning_rate: Schedule = 1e-4
     batch_size: int = 32
-    buffer_size: int = field(default=1_000_000, metadata=_COUNT)
-    learning_starts: int = field(default=100, metadata=bounds(0))
-    tau: float = field(default=1.0, metadata=_SHARE)
+    buffer_size: int = setting(1_000_000, _COUNT)
+    learning_starts: int = setting(100, Bounds(0))
+    tau: float = setting(1.0, _SHARE)
     train_freq: WholeNumbers = 4  # steps of the batch, or [n, step] or [n, episode]
-    gradient_steps: int = field(default=1, metadata=bounds(-1))
+    gradient_steps: int = setting(1, Bounds(-1))
     replay_buffer_class: Optional[ClassPath] = None  # noqa: UP045
-    replay_buffer_kwargs: Arguments = field(default_factory=dict)
+    replay_buffer_kwargs: Arguments = setting(dict)
     # rewards are multiplied by it on their way to DQN; null: they are as they are
     reward_scale: Optional[float] = None  # noqa: UP045
     optimize_memory_usage: bool = False
-    n_steps: int = field(default=1, metadata=bounds(1, MOST_STEPS))
-    target_update_interval: int = field(default=10_000, metadata=_COUNT)
-    exploration_fraction: float = field(default=0.1, metadata=bounds(0, 1, above=True))
-    exploration_initial_eps: float = field(default=1.0, metadata=_SHARE)
-    exploration_final_eps: float = field(default=0.05, metadata=_SHARE)
-    max_grad_norm: float = field(default=10.0, metadata=_POSITIVE)
+    n_steps: int = setting(1, Bounds(1, MOST_STEPS))
+    target_update_interval: int = setting(10_000, _COUNT)
+    exploration_fraction: float = setting(0.1, Bounds(0, 1, above=True))
+    exploration_initial_eps: float = setting(1.0, _SHARE)
+    exploration_final_eps: float = setting(0.05, _SHARE)
+    max_grad_norm: float = setting(10.0, _POSITIVE)
 
     def check(self, run: TrainConfig) -> None:
         super().check(run)
@@ -304,22 +296,22 @@ class PPOConfig(SB3CheckedConfig):
     known_by = "n_epochs"
     name: Word = "ppo"
     algorithm: Word = "PPO"
-    policy_kwargs: ActorCriticPolicyKwargs = field(default_factory=ActorCriticPolicyKwargs)
+    policy_kwargs: ActorCriticPolicyKwargs = setting(ActorCriticPolicyKwargs)
     learning_rate: Schedule = 3e-4
-    n_steps: int = field(default=2048, metadata=_COUNT)
-    n_epochs: int = field(default=10, metadata=_COUNT)
-    gae_lambda: Schedule = field(default=0.95, metadata=rate(1))
-    clip_range: Schedule = field(default=0.2, metadata=rate(_MOST_RETURN, linear_only=True))
-    clip_range_vf: Optional[Schedule] = field(default=None, metadata=rate(_MOST_RETURN, linear_only=True))  # noqa: UP045
+    n_steps: int = setting(2048, _COUNT)
+    n_epochs: int = setting(10, _COUNT)
+    gae_lambda: Schedule = setting(0.95, Rate(high=1))
+    clip_range: Schedule = setting(0.2, Rate(high=_MOST_RETURN, linear_only=True))
+    clip_range_vf: Optional[Schedule] = setting(None, Rate(high=_MOST_RETURN, linear_only=True))  # noqa: UP045
     normalize_advantage: bool = True
-    ent_coef: Schedule = field(default=0.0, metadata=rate())
-    vf_coef: float = field(default=0.5, metadata=bounds(0))
-    max_grad_norm: float = field(default=0.5, metadata=_POSITIVE)
+    ent_coef: Schedule = setting(0.0, Rate())
+    vf_coef: float = setting(0.5, Bounds(0))
+    max_grad_norm: float = setting(0.5, _POSITIVE)
     use_sde: bool = False
     sde_sample_freq: int = -1
     rollout_buffer_class: Optional[ClassPath] = None  # noqa: UP045
-    rollout_buffer_kwargs: Arguments = field(default_factory=dict)
-    target_kl: Optional[float] = field(default=None, metadata=_POSITIVE)  # noqa: UP045
+    rollout_buffer_kwargs: Arguments = setting(dict)
+    target_kl: Optional[float] = setting(None, _POSITIVE)  # noqa: UP045
 
     def check(self, run: TrainConfig) -> None:
         super().check(run)
@@ -333,8 +325,8 @@ class PPOConfig(SB3CheckedConfig):
 SCHEMAS: dict[str, type[AgentConfig]] = {"dqn": DQNConfig, "ppo": PPOConfig, "sb3": SB3ClassConfig}
 
 _BOUNDS: dict[str, Bounds] = {  # of numbers by their names in SB3 and sb3-contrib
-    name: metadata[BOUNDS]
+    name: found[Bounds]
     for schema in (DQNConfig, PPOConfig)
-    for name, metadata in declared(schema).items()
-    if BOUNDS in metadata
+    for name, found in declared(schema).items()
+    if Bounds in found
 }

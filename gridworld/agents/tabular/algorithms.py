@@ -7,7 +7,7 @@ Reference: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, sectio
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +24,7 @@ from gridworld.agents.tabular.td_control import (
 )
 from gridworld.base.errors import InputError
 from gridworld.base.serialization import State
-from gridworld.config.fields import Word, privilege
+from gridworld.config.fields import Privilege, Word, setting
 from gridworld.config.train import AgentConfig
 from gridworld.world.evaluation import PolicySnapshot
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
@@ -157,9 +157,7 @@ class ValueIterationConfig(TabularConfig):
     """The exact optimum under `gamma`; nothing is trained."""
 
     name: Word = "value_iteration"
-    algorithm: Word = field(
-        default="value_iteration", metadata=privilege("plans with the tables", "value_iteration")
-    )
+    algorithm: Word = setting("value_iteration", Privilege("plans with the tables", "value_iteration"))
 
     def build(self, context: TrainingContext) -> ValueIteration:
         return ValueIteration(self, context)

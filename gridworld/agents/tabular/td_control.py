@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, Hook, SafePoint, TrainingContext, misfit
-from gridworld.base.bounds import Bounds, parse_schedule
+from gridworld.base.bounds import Bounds, Rate, parse_schedule
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import read_bytes
 from gridworld.base.serialization import (
@@ -31,7 +31,7 @@ from gridworld.base.serialization import (
     set_generator_state,
 )
 from gridworld.base.user_input import npz_arrays, npz_bytes
-from gridworld.config.fields import MOST_KEPT, Effect, Schedule, Word, affects, bounds, rate
+from gridworld.config.fields import MOST_KEPT, Effect, Schedule, Word, setting
 from gridworld.config.train import AgentConfig, TrainConfig
 from gridworld.world.evaluation import PolicySnapshot
 from gridworld.world.mdp import LEAST_REWARD, MOST_REWARD, FloatArray, IntArray
@@ -46,7 +46,7 @@ _SPARE_BYTES = 2**20  # of a model file, for the frames around its arrays
 @dataclass
 class TabularConfig(AgentConfig):
     family: Word = "tabular"
-    gamma: float = field(default=0.99, metadata=bounds(0, 1))  # the discount it learns with
+    gamma: float = setting(0.99, Bounds(0, 1))  # the discount it learns with
 
     def check(self, run: TrainConfig) -> None:
         super().check(run)
@@ -69,20 +69,20 @@ class TabularControlConfig(TabularConfig):
     """Temporal-difference control. Where Stable-Baselines3 has the same setting, it has the same name."""
 
     # step size; a number; lin_NUMBER, sqrt_NUMBER and quad_NUMBER fall to 0
-    learning_rate: Schedule = field(default=0.1, metadata=rate(1, above=True))
+    learning_rate: Schedule = setting(0.1, Rate(high=1, above=True))
     # times (visits of the state and action) ** -power
-    learning_rate_power: float = field(default=0.0, metadata=bounds(0, 1))
+    learning_rate_power: float = setting(0.0, Bounds(0, 1))
     # of every action in every state that is no end
-    initial_value: float = field(default=0.0, metadata=bounds(-MOST_REWARD, MOST_REWARD, least=LEAST_REWARD))
+    initial_value: float = setting(0.0, Bounds(-MOST_REWARD, MOST_REWARD, least=LEAST_REWARD))
     # of training, in which epsilon falls linearly
-    exploration_fraction: float = field(default=1.0, metadata=bounds(0, 1, above=True))
+    exploration_fraction: float = setting(1.0, Bounds(0, 1, above=True))
     # epsilon when training begins
-    exploration_initial_eps: float = field(default=1.0, metadata=bounds(0, 1))
-    exploration_final_eps: float = field(default=0.05, metadata=bounds(0, 1))  # epsilon after that fraction
+    exploration_initial_eps: float = setting(1.0, Bounds(0, 1))
+    exploration_final_eps: float = setting(0.05, Bounds(0, 1))  # epsilon after that fraction
     # episodes that the means in TensorBoard are taken over
-    stats_window_size: int = field(default=100, metadata=affects(Effect.LABELS) | bounds(1, MOST_KEPT))
+    stats_window_size: int = setting(100, Effect.LABELS, Bounds(1, MOST_KEPT))
     # episodes between two points there
-    log_interval: int = field(default=100, metadata=affects(Effect.LABELS) | bounds(1))
+    log_interval: int = setting(100, Effect.LABELS, Bounds(1))
 
 
 class TabularAgent(Agent):
