@@ -67,19 +67,13 @@ def named_world(name: str, **settings: Any) -> Mdp:
 
     `settings` change keys of `env`. The world has the step limit of the settings as `max_episode_steps`.
     """
-    names = sorted(path.stem for path in (conf_folder() / "env").glob("*.yaml"))
-    if name in names:
-        env = compose([f"env={name}"]).env
-    elif is_id(name):
+    env: EnvConfig
+    if is_id(name):
         env = GymnasiumConfig(id=name)
     elif name.endswith(".txt"):
         env = MapConfig(layout=name)
     else:
-        all_of_them = (
-            "; give a Gymnasium id such as FrozenLake-v1, module:NAME of a class or a function, a map "
-            f"file, or one of {', '.join(names)}"
-        )
-        raise InputError(f"env={name}: no such world{meant(name, names) or all_of_them}")
+        env = compose([f"env={literal(name, 'env')}", "tuned=none"]).env
     known = {field.name for field in dataclasses.fields(env)} - {"source"}
     if wrong := sorted(set(settings) - known):
         raise InputError(f"{wrong[0]}: is not a setting of env={name}{meant(wrong[0], sorted(known))}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import re
+from collections.abc import Sequence
 from typing import Any
 
 from hydra.errors import MissingConfigException, OverrideParseException
@@ -62,6 +63,11 @@ _OF_SCHEMAS = {  # what to write where a schema lacks a key
     "SB3ClassConfig": "an argument of the class is written as +agent.arguments.gamma=0.9",
     "DimensionConfig": "a line of a search space is agent.gamma: {type: float, low: 0, high: 1}, say",
 }
+_OF_GROUPS = {  # what else a choice may be
+    "agent": "; a yaml file of your own needs --config-dir FOLDER",
+    "env": "; or give a Gymnasium id such as FrozenLake-v1, or module:NAME of a class or a function; "
+    "a yaml file of your own needs --config-dir FOLDER",
+}
 _OTHER_NAMES = {  # what people and other libraries call a setting or a choice: what it is called here
     "size": "env.num_rows and env.num_cols",
     "width": "env.num_cols",
@@ -82,7 +88,9 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, InputError):
         return str(error)
     if isinstance(error, MissingConfigException):
-        return _unknown_choice(error)
+        group, _, name = str(error.missing_cfg_file).rpartition("/")
+        choices = {*(error.options or ()), *(pairs() if group == "experiment" else ())}
+        return no_such(group, name, sorted(choices))
     if isinstance(error, OSError) and error.strerror:
         return failure(error)
     if (mark := getattr(error, "problem_mark", None)) is not None:  # of yaml
@@ -110,23 +118,17 @@ def sentence(error: BaseException) -> str:
     return place + text
 
 
-def _unknown_choice(error: MissingConfigException) -> str:
-    group, _, name = str(error.missing_cfg_file).rpartition("/")
-    choices = list(error.options or ())
-    if group == "experiment":
-        choices = sorted({*choices, *pairs()})
-    fact = f"{group}={name}: no such choice"
-    if len(choices) <= _LISTED:
-        hint = meant(name, choices)
-        if group == "agent" and name.lower() in _CONTINUOUS:
-            hint = "; it learns continuous actions, which these worlds do not have"
-        elif not hint and group in ("agent", "env"):
-            hint = "; a yaml file of your own needs --config-dir FOLDER"
-        return f"{fact}; choose from {', '.join(choices)}{hint}"
-    near = [choice for choice in choices if choice.startswith(name)]
-    near = near or difflib.get_close_matches(name, choices)
-    hint = f"; close matches: {', '.join(near)}" if near else ""
-    return f"{fact}{hint}; --help lists them all"
+def no_such(group: str, name: str, choices: Sequence[str]) -> str:
+    """Say that a group of files has no such choice, and which one may be meant."""
+    fact = f"{group}={name}: no such {'recipe' if group == 'tuned' else 'choice'}"
+    if len(choices) > _LISTED:
+        near = [choice for choice in choices if choice.startswith(name)]
+        near = near or difflib.get_close_matches(name, choices)
+        return f"{fact}{'; close matches: ' if near else ''}{', '.join(near)}; --help lists them all"
+    hint = meant(name, choices) or _OF_GROUPS.get(group, "")
+    if group == "agent" and name.lower() in _CONTINUOUS:
+        hint = "; it learns continuous actions, which these worlds do not have"
+    return f"{fact}; choose from {', '.join(choices)}{hint}"
 
 
 def _unknown_key(error: ConfigKeyError | ConfigAttributeError, in_a_file: bool) -> str:
@@ -159,7 +161,7 @@ def _unknown_key(error: ConfigKeyError | ConfigAttributeError, in_a_file: bool) 
     return fact + (_or(sorted(name for name in last if last[name] in alike)) or "; --cfg job shows all keys")
 
 
-def meant(key: str, known: list[str]) -> str:
+def meant(key: str, known: Sequence[str]) -> str:
     """The names that `key` looks like, or the one that it has elsewhere, as a question; "" for none."""
     named = [name for name in known if name == _OTHER_NAMES.get(key)]
     return _or(named or difflib.get_close_matches(key.lower(), known))

@@ -18,7 +18,6 @@ once more with `tuned=` it, as if it had been typed. Names of files count, never
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -91,12 +90,12 @@ class Chosen:
                 raise InputError(f"{old}: a recipe is in its agent's folder; move it to {place}")
         if self.is_open or self.tuned in (NONE, "None") or self.has(self.tuned):
             return
+        from gridworld.config.messages import no_such  # here, with Hydra, which takes its time
+
         groups = [folder / GROUP for folder in self.folders]
         files = [(file, group) for group in groups for file in group.rglob("*.yaml")]
         known = sorted(file.relative_to(group).with_suffix("").as_posix() for file, group in files)
-        near = difflib.get_close_matches(self.tuned, known)
-        hint = f"; close matches: {', '.join(near)}" if near else ""
-        raise InputError(f"{GROUP}={self.tuned}: no such recipe{hint}; --help lists them all")
+        raise InputError(no_such(GROUP, self.tuned, known))
 
     def settle(self, config: TrainConfig, words: Iterable[str]) -> TrainConfig:
         """Set what the names say and no file can: the recipe, and whether it is known to fail as used."""

@@ -1,12 +1,8 @@
 """Every setting of a training run, typed: the schema that the files in `conf/` fill in.
 
-Plain dataclasses. Hydra merges the yaml files and the command line into them and refuses a misspelt key or
-a wrong type by name; `check` refuses numbers outside of the bounds that their fields declare
-(`gridworld.config.fields`). Nothing heavy is imported here.
-
-Pictures are declared at the field of their setting. The run's folder, TensorBoard, `record.py` and the
-report's page read the table `PICTURES`. To add one, add a field to `RecordingConfig` and a function to
-`gridworld.visualization` (see `gridworld.visualization.picture`).
+Hydra refuses a misspelt key or a wrong type, `check` numbers outside of the bounds that their fields declare
+(`gridworld.config.fields`). Nothing heavy is imported here. To add a picture, add a field to
+`RecordingConfig` and a function to `gridworld.visualization` (see `gridworld.visualization.picture`).
 """
 
 from __future__ import annotations
@@ -145,19 +141,9 @@ class Picture:
         return Path(self.file).stem
 
     @property
-    def label(self) -> str:
-        """What a warning calls it: the files of one episode have one name, so that it is told once."""
-        return self.file if self.caption else f"the {self.drawer.partition('.')[0]}"
-
-    @property
     def is_map(self) -> bool:
         """Whether it is a still picture of the whole world."""
         return self.file.endswith(".png")
-
-    @property
-    def is_in_tensorboard(self) -> bool:
-        """Whether TensorBoard can show it."""
-        return self.file.endswith((".png", ".gif"))
 
 
 @dataclass

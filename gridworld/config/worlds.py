@@ -10,7 +10,8 @@ import functools
 import re
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, make_dataclass
+from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,11 +57,18 @@ class EnvConfig:
 
     def step_limit(self, mdp: Mdp) -> int:
         """The step limit of an episode in the compiled world."""
-        limit = self.max_episode_steps or mdp.max_episode_steps or STEP_LIMIT
+        own = mdp.max_episode_steps
+        limit = self.max_episode_steps or own or STEP_LIMIT
         if limit > MOST_STEPS:
             raise InputError(
                 f"env.max_episode_steps: {mdp.name} has its own step limit of {limit:,}; give one of at "
                 f"most {MOST_STEPS:,}"
+            )
+        if own is not None and limit > own and mdp.is_enumerated:
+            # the environment itself ends its episodes at its own limit
+            raise InputError(
+                f"env.max_episode_steps={limit}: {mdp.name} truncates its episodes after {own} steps; "
+                f"give at most {own}"
             )
         return limit
 
@@ -131,16 +139,6 @@ class GymnasiumConfig(EnvConfig):
         mdp = compile_id(self.id, self.kwargs, **how)
         return same_elsewhere(mdp, self.id, self.kwargs, time.monotonic() - began, **how)
 
-    def step_limit(self, mdp: Mdp) -> int:
-        limit, own = super().step_limit(mdp), mdp.max_episode_steps
-        if own is not None and limit > own and mdp.is_enumerated:
-            # the environment itself ends its episodes at its own limit
-            raise InputError(
-                f"env.max_episode_steps={limit}: {mdp.name} truncates its episodes after {own} steps; "
-                f"give at most {own}"
-            )
-        return limit
-
 
 @dataclass
 class EnumeratedConfig(GymnasiumConfig):
@@ -206,48 +204,26 @@ class ClassicConfig(EnvConfig):
             raise InputError(f"env.{error}") from None
 
 
-@dataclass
-class RiverSwimConfig(ClassicConfig):
-    """Against the current to a large reward, or with it to a small one."""
-
-    source: Word = "river_swim"
-    length: int = 6  # states
-
-
-@dataclass
-class DeepSeaConfig(ClassicConfig):
-    """One way of 2 ** size leads to the treasure."""
-
-    source: Word = "deep_sea"
-    size: int = 10  # rows and columns
-    seed: int | None = None  # of what the actions mean in each cell; null: left and right
+def _classic(source: str, **sizes: int | None) -> type[ClassicConfig]:
+    """The schema of a world of the literature, with the defaults of its sizes; null: not given."""
+    fields = [(name, int | None if size is None else int, size) for name, size in sizes.items()]
+    namespace = {"__module__": __name__}
+    return make_dataclass(
+        source, [("source", Word, source), *fields], bases=(ClassicConfig,), namespace=namespace
+    )
 
 
-@dataclass
-class CombinationLockConfig(ClassicConfig):
-    """A wrong action leads back to the start."""
-
-    source: Word = "combination_lock"
-    length: int = 10  # actions that open it
-    num_actions: int = 2  # of each state
-    seed: int | None = None  # of the combination; null: the last action everywhere
-
-
-@dataclass
-class RandomWalkConfig(ClassicConfig):
-    """A chain whose right end pays 1."""
-
-    source: Word = "random_walk"
-    length: int = 5  # states without the ends, an odd number
+river_swim = _classic("river_swim", length=6)  # states
+deep_sea = _classic("deep_sea", size=10, seed=None)  # rows and columns; of what the actions mean in each cell
+combination_lock = _classic("combination_lock", length=10, num_actions=2, seed=None)  # of the combination
+random_walk = _classic("random_walk", length=5)  # states without the ends, an odd number
 
 
 @functools.lru_cache(maxsize=4, typed=True)  # the jobs of a sweep have few worlds
-def _compiled(
-    layout: Layout, slip: float, step_reward: float, goal_reward: float, trap_reward: float
-) -> GridMdp:
+def _compiled(layout: Layout, *rewards: float) -> GridMdp:
     from gridworld.world.grid import compile_mdp
 
-    return compile_mdp(layout, slip, step_reward, goal_reward, trap_reward)
+    return compile_mdp(layout, *rewards)
 
 
 def is_id(text: str) -> bool:
@@ -256,11 +232,7 @@ def is_id(text: str) -> bool:
 
 
 World = Callable[[EnvConfig], "Mdp"]  # makes the world of these settings
-
-
-def compiled(env: EnvConfig) -> Mdp:
-    """The world of these settings."""
-    return env.compile()
+compiled: World = methodcaller("compile")
 
 
 def each_once() -> World:
@@ -287,8 +259,5 @@ SOURCES: dict[str, type[EnvConfig]] = {
     "enumerated": EnumeratedConfig,
     "arrays": ArraysConfig,
     "built": BuiltConfig,
-    "river_swim": RiverSwimConfig,
-    "deep_sea": DeepSeaConfig,
-    "combination_lock": CombinationLockConfig,
-    "random_walk": RandomWalkConfig,
+    **{schema.source: schema for schema in (river_swim, deep_sea, combination_lock, random_walk)},
 }

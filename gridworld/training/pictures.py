@@ -85,12 +85,14 @@ class Pictures:
         for picture in PICTURES:
             if not getattr(self._config.recording, picture.setting):
                 continue
-            with self._left_out_if_too_large(picture.label):
+            # The files of one episode are left out with one warning.
+            label = picture.file if picture.caption else f"the {picture.drawer.partition('.')[0]}"
+            with self._left_out_if_too_large(label):
                 if picture.drawer not in prepared:
                     prepared[picture.drawer] = drawer(picture.drawer)(subject)
                 draw = prepared[picture.drawer]
                 save(draw(None), self._folder / picture.file, self._config.recording.fps)
-                if picture.is_in_tensorboard and not picture.while_training:
+                if picture.file.endswith((".png", ".gif")) and not picture.while_training:
                     self._show(picture, draw, evaluation.step)
 
     def _show_development(self, evaluation: Evaluation) -> None:

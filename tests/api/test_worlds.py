@@ -140,10 +140,13 @@ def test_a_run_is_scored_on_its_own_world() -> None:
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
-        (lambda: gridworld.evaluate([1], "clif"), "env=clif: no such world; did you mean cliff"),
+        (
+            lambda: gridworld.evaluate([1], "clif"),
+            "env=clif: no such choice; choose from .*; did you mean cliff",
+        ),
         (lambda: gridworld.evaluate([1], "Nowhere-v1"), "env.id=Nowhere-v1: "),
         (lambda: gridworld.evaluate([1], "arrays"), "env.path: has no value"),
-        (lambda: gridworld.compile_env("nowhere"), "env=nowhere: .* one of aima_4x3, "),
+        (lambda: gridworld.compile_env("nowhere"), "env=nowhere: .* choose from aima_4x3, "),
         (
             lambda: gridworld.compile_env(gym.make("CartPole-v1")),
             "its states are continuous",
@@ -302,7 +305,7 @@ def refused(*given: Any, **named: Any) -> str:
         (([1] * 30,), {}, "env: is required"),
         (([1] * 30, "classic"), {"gamma": "x"}, "gamma=x: must be a number"),
         (("runs/a",), {}, r"runs/a is a path; open the run with open_run"),
-        (([1] * 30, "nope"), {}, "env=nope: no such world"),
+        (([1] * 30, "nope"), {}, "env=nope: no such choice"),
         (([1] * 30, 3), {}, "env: int is not an environment"),
         (([1] * 30, "classic"), {"gamma": 2}, "gamma=2: must be from 0 to 1"),
         (([1] * 30, "classic"), {"max_episode_steps": 0}, "max_episode_steps"),
