@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from numpy.typing import ArrayLike
 
-from gridworld.base.bounds import discount
+from gridworld.base.bounds import Discount
 from gridworld.base.errors import InputError, on_a_line
 from gridworld.config.compose import named_world
 from gridworld.config.worlds import is_id
@@ -91,7 +91,7 @@ def evaluate(
         gamma = evaluator.solution.gamma if gamma is None else gamma
         place = replace(evaluator.mdp, max_episode_steps=evaluator.max_episode_steps)
     gamma = 0.99 if gamma is None else gamma
-    discount("gamma", gamma)
+    Discount().check("gamma", gamma)
     task = task_of(place, max_episode_steps)
     mdp, limit = task.mdp, task.max_episode_steps
     if is_model:

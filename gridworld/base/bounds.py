@@ -100,14 +100,20 @@ def parse_schedule(key: str, value: int | float | str, linear_only: bool = False
     return Decay(number, _POWERS.get(form, 0.0))
 
 
-def discount(key: str, value: float) -> None:
-    """Refuse a value outside [0, 1], or one so near to 1 that double precision loses the cost of a step."""
-    Bounds(0, 1).check(key, value)
-    if NEAREST_GAMMA < value < 1:
-        raise InputError(
-            f"{key}={value}: is so close to 1 that rounding hides the cost of a step; must be 1 or at most "
-            f"{NEAREST_GAMMA}"
-        )
+@dataclass(frozen=True)
+class Discount(Bounds):
+    """A number from 0 to 1, and not so near to 1 that double precision loses the cost of a step."""
+
+    low: float = 0
+    high: float = 1
+
+    def check(self, key: str, number: Any, written: object = None) -> None:
+        super().check(key, number, written)
+        if NEAREST_GAMMA < number < 1:
+            raise InputError(
+                f"{key}={number}: is so close to 1 that rounding hides the cost of a step; must be 1 or at "
+                f"most {NEAREST_GAMMA}"
+            )
 
 
 def digits(text: str) -> str:

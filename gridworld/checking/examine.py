@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from gridworld.base.bounds import STEP_LIMIT, Bounds, discount
+from gridworld.base.bounds import STEP_LIMIT, Bounds, Discount
 from gridworld.base.errors import GYMNASIUM, InputError, in_short, on_a_line
 from gridworld.checking.function import SingleEnv
 from gridworld.checking.sampling import Actions, Env, Replays, generators_restored, replays, sample
@@ -97,7 +97,7 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
         >>> examine("CliffWalking-v1").passed
         True
     """
-    discount("gamma", gamma)
+    Discount().check("gamma", gamma)
     Bounds(low=100).check("steps", steps)
     began = time.monotonic()
     with generators_restored(env), warnings.catch_warnings(), np.errstate(all="ignore"):

@@ -14,11 +14,7 @@ from typing import Any
 
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
-from omegaconf.errors import (
-    ConfigAttributeError,
-    ConfigKeyError,
-    OmegaConfBaseException,
-)
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from gridworld.base.errors import InputError, failure
 from gridworld.config.settings import all_settings, flat
@@ -93,9 +89,8 @@ def sentence(error: BaseException) -> str:
         return no_such(group, name, sorted(choices))
     if isinstance(error, OSError) and error.strerror:
         return failure(error)
-    if (mark := getattr(error, "problem_mark", None)) is not None:  # of yaml
-        problem = getattr(error, "problem", None)
-        return f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is not valid YAML: {problem}"
+    if (mark := getattr(error, "problem_mark", None)) is not None:
+        return f"{mark.name}: {not_yaml(error)}"
     if isinstance(error, OverrideParseException):
         what = "is a comma, a bracket or a quotation mark missing or left over?"
         return f"{error.override}: is not valid syntax; {what}"
@@ -118,6 +113,13 @@ def sentence(error: BaseException) -> str:
     return place + text
 
 
+def not_yaml(error: BaseException) -> str:
+    """Say what a text lacks to be YAML, and where, in one line."""
+    mark = getattr(error, "problem_mark", None)
+    where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark is not None else ""
+    return f"{where}is not valid YAML: {' '.join(str(getattr(error, 'problem', error)).split())[:200]}"
+
+
 def no_such(group: str, name: str, choices: Sequence[str]) -> str:
     """Say that a group of files has no such choice, and which one may be meant."""
     fact = f"{group}={name}: no such {'recipe' if group == 'tuned' else 'choice'}"
@@ -138,10 +140,8 @@ def _unknown_key(error: ConfigKeyError | ConfigAttributeError, in_a_file: bool) 
         plus = f"; a new entry of a dictionary needs a plus: +{place}=..."
         return f"{place}: no such setting{_SPACE if place.startswith('tune.') else plus}"
     of = f" of {kind.__name__.removesuffix('Config')}" if issubclass(kind, AgentConfig) else ""
-    fact, own = (
-        f"{place}: no such setting{of}",
-        sorted({each.name for each in dataclasses.fields(kind)} - {key}),
-    )
+    fact = f"{place}: no such setting{of}"
+    own = sorted({each.name for each in dataclasses.fields(kind)} - {key})
     if in_a_file and key in (each.name for each in dataclasses.fields(TrainConfig)):
         return f"{fact}; the file's first line must be  # @package _global_"
     if in_a_file and kind.__name__ == "TuneConfig":

@@ -20,6 +20,7 @@ from gridworld.base.bounds import LARGEST_INTEGER
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import as_text, read_bytes
 from gridworld.config.fields import MISSING, Text
+from gridworld.config.messages import not_yaml
 from gridworld.config.recipes import CHOSEN
 from gridworld.config.settings import check_foreign, settings_of_a_run
 from gridworld.config.words import split
@@ -91,10 +92,7 @@ def _read(path: Path) -> Any:
     except InputError:
         raise
     except (yaml.YAMLError, ValueError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark is not None else ""
-        what = " ".join(str(getattr(error, "problem", error)).split())[:200]
-        raise InputError(f"{path}: {where}is not valid YAML: {what}") from None
+        raise InputError(f"{path}: {not_yaml(error)}") from None
 
 
 def _check_plain(text: str, path: Path) -> None:

@@ -30,7 +30,7 @@ from gridworld.base.errors import InputError
 from gridworld.config.fields import Effect
 from gridworld.config.settings import effect_of, has_own_code
 from gridworld.config.train import TrainConfig
-from gridworld.config.words import CLASSES, conf_folder
+from gridworld.config.words import CLASSES, conf_folder, key_of
 from gridworld.config.worlds import EnvConfig, World, compiled
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
@@ -42,8 +42,6 @@ STOCHASTIC, LARGE = CLASSES
 _DEFAULT_WORLD, _DEFAULT_STATES = "classic", 30
 _ENGINE = "tabulated"  # the only one for which the numbers of a class are made
 _SIZE = ("total_timesteps", "n_envs")
-_GIVEN = re.compile(rf"[+~]*{GROUP}\b")
-_SIZED = re.compile(rf"[+~]*({'|'.join(_SIZE)})\b")
 MAY_NEED = re.compile(rf"[+~]*(env|experiment|hydra|{GROUP})\b")  # words that may lead to a recipe
 _OTHER_WORLD = re.compile(r"[+~]*(env\.(?!max_episode_steps\b)|env=\{|experiment\b)")
 _WITH = " with "  # AGENT with ANOTHER/WORLD
@@ -82,6 +80,14 @@ class Chosen:
         """Whether there is such a file."""
         return any((folder / GROUP / f"{recipe}.yaml").is_file() for folder in self.folders)
 
+    def has_its_sizes(self, config: TrainConfig) -> bool:
+        """Whether what the numbers of a class's recipe rest on is in settings as its file has it."""
+        if self.tuned.rpartition("/")[2] not in CLASSES:
+            return True
+        files = (folder / GROUP / f"{self.tuned}.yaml" for folder in self.folders)
+        content = yaml.safe_load(next(filter(Path.is_file, files)).read_text("utf-8"))
+        return all(getattr(config, key) == content.get(key, getattr(config, key)) for key in _SIZE)
+
     def check(self) -> None:
         """Refuse a missing recipe, and one of the user's own that is not in its agent's folder."""
         for tuned in (folder / GROUP for folder in self.folders):
@@ -103,7 +109,7 @@ class Chosen:
         if (name := self.recipe) is not None:
             config.recipe = name if name.startswith(f"{self.agent}/") else f"{self.agent}{_WITH}{name}"
             measured = name.rpartition("/")[2]
-        keys = {word.lstrip("+~").partition("=")[0] for word in words} - {"agent", "env", GROUP}
+        keys = set(map(key_of, words)) - {"agent", "env", GROUP}
         is_changed = any(effect_of(key) in _MEASURED for key in keys if not key.startswith("hydra"))
         if is_changed or measured not in (self.env, *config.env.recipes_of):
             config.known_failure = None
@@ -128,14 +134,13 @@ def with_recipe_by_rule(
     """
     config, chosen = compose([])
     chosen.check()
-    if chosen.is_open and not any(map(_GIVEN.match, words)):
+    if chosen.is_open and GROUP not in map(key_of, words):
         for name in _in_order(config, chosen, words, world):
             if name == chosen.recipe:
                 break
             word = f"{GROUP}={name or NONE}"
             again, others = compose([word])
-            sizes = {} if name is None else _sizes(others, name)
-            if all(getattr(again, key) == number for key, number in sizes.items()):
+            if name is None or others.has_its_sizes(again):
                 return others.settle(again, words), others, [word]
     return chosen.settle(config, words), chosen, []
 
@@ -148,11 +153,9 @@ def _in_order(
     own = next(filter(chosen.has, names), None)
     is_changed = any(map(_OTHER_WORLD.match, words)) and not is_world(config.env, chosen.env)
     is_changed = is_changed and chosen.has(f"{chosen.agent}/{STOCHASTIC}")
-    if own is not None and not (
-        is_changed and (mdp := _compiled(lambda: world(config.env))) is not None and mdp.is_stochastic
-    ):
+    if own is not None and not (is_changed and _class_of(lambda: world(config.env)) == STOCHASTIC):
         yield own
-    elif not any(map(_SIZED.match, words)):
+    elif not any(key in _SIZE for key in map(key_of, words)):
         yield recipe_of_class(chosen.agent, config, lambda: world(config.env), chosen.has)
     yield None
 
@@ -167,19 +170,17 @@ def recipe_of_class(
     known = [name for name in CLASSES if has(f"{agent}/{name}")]
     if not known or getattr(config.agent, "engine", _ENGINE) != _ENGINE or has_own_code(config.callbacks):
         return None
-    mdp = _compiled(world)
-    if mdp is None:
-        return None
-    name = STOCHASTIC if mdp.is_stochastic else LARGE if mdp.num_states > _DEFAULT_STATES else None
+    name = _class_of(world)
     return f"{agent}/{name}" if name in known else None
 
 
-def _compiled(world: Callable[[], Mdp]) -> Mdp | None:
-    """The world; None where the settings make none: the check before training says why."""
+def _class_of(world: Callable[[], Mdp]) -> str | None:
+    """The class of a world; None where the settings make none, too: the check before training says why."""
     try:
-        return world()
+        mdp = world()
     except (InputError, TypeError, ValueError, OSError):
         return None
+    return STOCHASTIC if mdp.is_stochastic else LARGE if mdp.num_states > _DEFAULT_STATES else None
 
 
 def is_world(env: EnvConfig, name: str) -> bool:
@@ -191,31 +192,3 @@ def is_world(env: EnvConfig, name: str) -> bool:
     given = dataclasses.asdict(env)
     keys = (own.keys() | given.keys()) - {"defaults", "max_episode_steps", "recipes_of"}
     return all(key in given and own[key] == given[key] for key in keys)
-
-
-def recipe_note(config: TrainConfig, mdp: Mdp) -> str | None:
-    """What a user should know of a run's recipe before training: which it is, why, how to leave it out."""
-    agent, recipe = agent_and_recipe(config)
-    size = f"{mdp.name} has {mdp.num_states:,} states"
-    why = f"{mdp.name} is stochastic" if mdp.is_stochastic else size
-    if recipe is None:
-        fitting = recipe_of_class(agent, config, lambda: mdp)
-        return None if fitting is None else f"{why}; for settings that suit it, add {GROUP}={fitting}"
-    own, _, name = recipe.rpartition("/")
-    other = [] if own == agent else ["agent"]
-    is_shipped = (conf_folder() / "env" / f"{name}.yaml").is_file()
-    if is_shipped and name not in config.env.recipes_of and not is_world(config.env, name):
-        other.append("world")
-    reason = f", since {why}" if name in CLASSES else ""
-    reason = f", tuned for another {' and '.join(other)}" if other else reason
-    steps = f"{config.total_timesteps:,} steps"
-    return f"recipe {recipe}{reason}: {steps}; {GROUP}={NONE} keeps the agent's own settings"
-
-
-def _sizes(chosen: Chosen, recipe: str) -> dict[str, Any]:
-    """What the numbers of a class's recipe rest on, as its file has it."""
-    if recipe.rpartition("/")[2] not in CLASSES:
-        return {}
-    files = (folder / GROUP / f"{recipe}.yaml" for folder in chosen.folders)
-    content = yaml.safe_load(next(filter(Path.is_file, files)).read_text("utf-8"))
-    return {key: content[key] for key in _SIZE if key in content}

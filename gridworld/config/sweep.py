@@ -42,19 +42,19 @@ class JoblibConfig(ForksConfig):
 
 @dataclass
 class SlurmConfig:
-    """`hydra/launcher=slurm`; all but the first two are submitit's, by its names."""
+    """`hydra/launcher=slurm`; conf/hydra/launcher/slurm.yaml says what each setting is."""
 
     _target_: str = "gridworld.sweeps.launchers.slurm"
     jobs_per_task: int = setting(1, Bounds(1))
     array_parallelism: int = setting(256, Bounds(1))
     timeout_min: int = setting(60, Bounds(1))
     signal_delay_s: int = setting(60, Bounds(1))
-    cpus_per_task: int = setting(1, Bounds(1))  # cores
+    cpus_per_task: int = setting(1, Bounds(1))
     mem_gb: float | None = None
-    partition: str | None = None  # of Slurm's, and so below; null: the default
-    account: str | None = None  # that pays
-    qos: str | None = None  # quality of service
-    constraint: str | None = None  # features that a node must have
+    partition: str | None = None
+    account: str | None = None
+    qos: str | None = None
+    constraint: str | None = None
     setup: list[str] = setting(list)
     more: dict[str, Any] = setting(dict)
 
@@ -68,7 +68,12 @@ class RayConfig:
     remote: dict[str, Any] = setting(dict)
 
 
-LAUNCHER_SCHEMAS = {"forks": ForksConfig, "joblib": JoblibConfig, "slurm": SlurmConfig, "ray": RayConfig}
+LAUNCHER_SCHEMAS: dict[str, type[Any]] = {
+    "forks": ForksConfig,
+    "joblib": JoblibConfig,
+    "slurm": SlurmConfig,
+    "ray": RayConfig,
+}
 
 
 @dataclass
@@ -85,28 +90,25 @@ class DimensionConfig:
 
 @dataclass
 class TuneConfig:
-    """How `scripts/tune.py` searches; `tune` on the command line."""
+    """How `scripts/tune.py` searches; conf/tune.yaml says what each setting is."""
 
-    trials: int = setting(100, Bounds(1))  # the search ends after so many
-    seeds: int = setting(3, Bounds(1, _MOST_RUNS))  # a trial's: seed, seed + 1, ...
-    # trials that run on more seeds, together with the baseline
+    trials: int = setting(100, Bounds(1))
+    seeds: int = setting(3, Bounds(1, _MOST_RUNS))
     finalists: int = setting(5, Bounds(1, _MOST_RUNS))
-    final_seeds: int = setting(10, Bounds(0, _MOST_RUNS))  # the next ones, for the finalists
-    # the next ones, for the winner and the baseline
+    final_seeds: int = setting(10, Bounds(0, _MOST_RUNS))
     confirm_seeds: int = setting(20, Bounds(2, _MOST_RUNS))
-    study: str | None = None  # its name; null: of agent and world
-    folder: str | None = None  # null: runs/STUDY
-    storage: str | None = None  # any URL that Optuna takes; null: study.db in the folder
-    workers: int = setting(-1, Bounds(-1))  # processes; -1: one per core
-    together: int | None = setting(None, Bounds(1))  # trials of a worker at once; null: 8 of all, 1 of one
-    timeout: float | None = setting(None, Bounds(0, above=True))  # seconds; no trial starts after that
-    sampler: str = "tpe"  # or random
-    sampler_seed: int = setting(0, Bounds(0))  # of the search itself
-    pruner: str = "median"  # or hyperband, none
-    # per seed, at least, to resolve which trial is certified sooner
+    study: str | None = None
+    folder: str | None = None
+    storage: str | None = None
+    workers: int = setting(-1, Bounds(-1))
+    together: int | None = setting(None, Bounds(1))
+    timeout: float | None = setting(None, Bounds(0, above=True))
+    sampler: str = "tpe"
+    sampler_seed: int = setting(0, Bounds(0))
+    pruner: str = "median"
     evaluations: int = setting(50, Bounds(1, _MOST_LOOKS))
-    reports: int = setting(10, Bounds(1, _MOST_LOOKS))  # pruner's looks at a seed's curve
-    stop_after: int | None = setting(3, Bounds(1))  # a trial's seed ends at this many certificates in a row
+    reports: int = setting(10, Bounds(1, _MOST_LOOKS))
+    stop_after: int | None = setting(3, Bounds(1))
     space: dict[str, DimensionConfig] = setting(dict)  # conf/tune/*.yaml
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gridworld.base.bounds import LARGEST_INTEGER, MOST_ENVS, Bounds, discount
+from gridworld.base.bounds import LARGEST_INTEGER, MOST_ENVS, Bounds, Discount
 from gridworld.base.errors import InputError
 from gridworld.config.fields import (
     MISSING,
@@ -105,23 +105,20 @@ class ObservationConfig:
 
 @dataclass
 class EvaluationConfig:
-    """The exact evaluation."""
+    """The exact evaluation; what each setting is, here and below, is in conf/train.yaml."""
 
-    every: int = setting(1000, Bounds(1))  # environment steps
-    # discount of value and regret, whatever discount the agent learns with
-    gamma: float = setting(0.99, Effect.TASK)
-    stop_after: int | None = setting(None, Bounds(1))  # end training at this many certificates in a row
+    every: int = setting(1000, Bounds(1))
+    gamma: float = setting(0.99, Effect.TASK, Discount())
+    stop_after: int | None = setting(None, Bounds(1))
 
 
 @dataclass
 class LoggingConfig:
     """What is logged while training."""
 
-    tensorboard: bool = True  # write an event file
-    # evaluations between two pictures of the policy; 0 for none
+    tensorboard: bool = True
     policy_map_every: int = setting(5, Bounds(0))
     progress: bool = setting(True, Effect.NOTHING)
-    # log the scalars to W&B as well, while it trains
     wandb: Contact = setting(False, Effect.NOTHING)
 
 
@@ -150,21 +147,15 @@ class Picture:
 class RecordingConfig:
     """Pictures in the run's folder; TensorBoard gets them too."""
 
-    # values and greedy actions
     policy_map: bool = setting(True, Picture("policy.png", "maps.policy", "policy", while_training=True))
-    # how far the values are from the true ones
     q_error: bool = setting(True, Picture("q_error.png", "maps.q_error", "error of its values"))
-    # where training has been
     visits: bool = setting(True, Picture("visits.png", "maps.visits", "visits while it learned"))
-    # the policy over training
     learning: bool = setting(True, Picture("learning.gif", "maps.learning", "policy while it learned"))
-    # the final greedy policy's episode; MP4 needs the extra `video`
     frames: bool = setting(True, Picture("frames", "episode.episode"))
     gif: bool = setting(True, Picture("episode.gif", "episode.episode"))
     mp4: bool = setting(False, Picture("episode.mp4", "episode.episode"))
-    # pixels of a cell of the episode and of learning.gif; null: what fits
     cell_size: int | None = setting(None, Bounds(2))
-    fps: int = setting(4, Bounds(1, 100))  # frames a second
+    fps: int = setting(4, Bounds(1, 100))
 
 
 PICTURES: tuple[Picture, ...] = tuple(
@@ -178,7 +169,7 @@ PICTURES: tuple[Picture, ...] = tuple(
 class CheckpointConfig:
     """What it takes to go on after an interruption."""
 
-    every: int | Word | None = "auto"  # steps; auto: as it costs little; null: none
+    every: int | Word | None = AUTO
 
 
 @dataclass
@@ -194,13 +185,11 @@ class TrainConfig:
     n_envs: int = setting(64, Bounds(1, MOST_ENVS))  # environments that step together
     # b of b / sqrt(N), added to a reward of training for an action that was taken there N times; 0 for none
     exploration_bonus: float = setting(0.0, Bounds(0, MOST_BONUS))
-    # share of training episodes that begin in a state drawn uniformly
     exploring_starts: float = setting(0.0, Privilege("starts anywhere"), Bounds(0, 1))
-    # whether environments in one state share out an action's outcomes evenly, see `gridworld.envs.vector_env`
+    # see `gridworld.envs.vector_env`
     stratified_draws: bool = setting(False, Privilege("stratified draws"))
     device: Word = setting("cpu", Effect.MACHINE)
     threads: int = setting(1, Effect.MACHINE, Bounds(1, MOST_THREADS))  # of torch
-    # of SB3: each a mapping of `_target_`, the import path of a class, and its arguments
     callbacks: list[Callback] = setting(list)
     agent: AgentConfig = setting(AgentConfig)  # the chosen agent's own schema in its place
     env: EnvConfig = setting(MapConfig, Effect.TASK)  # of the chosen source (`config.worlds`)
@@ -214,7 +203,6 @@ class TrainConfig:
 def check(config: TrainConfig) -> None:
     """Check the values that no type can. Maps, rewards and what is the agents' own are checked elsewhere."""
     check_bounds(config)
-    discount("evaluation.gamma", config.evaluation.gamma)
     source = getattr(config.env, "source", None)
     if source is not None and SOURCES.get(source) is not type(config.env):
         raise InputError(f"env.source={source}: is not a setting; choose a source by env=...")

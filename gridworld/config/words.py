@@ -33,6 +33,11 @@ def conf_folder() -> Path:
     return installed if installed.is_dir() else _PACKAGE.parent / "conf"
 
 
+def key_of(word: str) -> str:
+    """The key of a setting or a choice in a command line, without a plus or a tilde."""
+    return word.lstrip("+~").partition("=")[0]
+
+
 def own_conf_folders(words: Sequence[str]) -> Iterator[Path]:
     """The folders that `--config-dir` names in a command line."""
     for word, following in itertools.pairwise([*words, ""]):
@@ -56,7 +61,7 @@ def prepared(words: Sequence[str], of_many: bool = False) -> list[str]:
     words `of_many` runs, a recipe stays as it is named, until these are known.
     """
     found = [] if of_many else _recipe(words)
-    chosen = {word.lstrip("+").partition("=")[0] for word in words if "=" in word}
+    chosen = {key_of(word) for word in words if "=" in word}
     for word in words:
         key, _, value = word.partition("=")
         name = key.lstrip("+")

@@ -14,7 +14,7 @@ from gridworld.base.console import aligned, command
 from gridworld.base.errors import InputError
 from gridworld.config.recipes import GROUP, agent_and_recipe, is_world, recipe_of_class
 from gridworld.config.train import TrainConfig
-from gridworld.config.words import conf_folder
+from gridworld.config.words import conf_folder, key_of
 from gridworld.run.folder import SWEEP_JSON, RunFolder, shell_path
 from gridworld.run.reader import RunReader, read_columns
 from gridworld.training.saved_run import SavedRun
@@ -48,13 +48,13 @@ def _trust(folder: Path) -> str:
 def _commands(saved: SavedRun, place: str) -> Iterator[list[str]]:
     """(why, command) of what may help."""
     run, config = saved.run, saved.config
-    words = [word for word in saved.overrides if _key(word) not in _REPLACED]
+    words = [word for word in saved.overrides if key_of(word) not in _REPLACED]
     agent, recipe = agent_and_recipe(config)
     is_open = recipe is None and not saved.omission  # then words of its command line are missing
     if is_open and (env := _world_with_recipe(agent, config)) is not None:
-        own = [word for word in words if _key(word).partition(".")[0] not in ("env", "experiment", "agent")]
+        own = [word for word in words if key_of(word).partition(".")[0] not in ("env", "experiment", "agent")]
         yield ["its recipe:", _train([f"agent={agent}", f"env={env}", *own])]
-    elif is_open and "experiment" not in map(_key, words):
+    elif is_open and "experiment" not in map(key_of, words):
         fitting = recipe_of_class(agent, config, lambda: saved.mdp)
         if fitting is not None:
             kind = fitting.rpartition("/")[2]
@@ -67,10 +67,6 @@ def _commands(saved: SavedRun, place: str) -> Iterator[list[str]]:
 
 def _train(words: Sequence[str]) -> str:
     return f"{command('train')} {shlex.join(words)}"
-
-
-def _key(word: str) -> str:
-    return word.lstrip("+~").partition("=")[0]
 
 
 def _world_with_recipe(agent: str, config: TrainConfig) -> str | None:

@@ -10,8 +10,9 @@ import numpy as np
 
 from gridworld.agents import TrainingContext, WriteScalars
 from gridworld.base.errors import InputError, install_command
-from gridworld.config.recipes import recipe_note
+from gridworld.config.recipes import GROUP, NONE, agent_and_recipe, is_world, recipe_of_class
 from gridworld.config.train import PICTURES, TrainConfig, check
+from gridworld.config.words import CLASSES, conf_folder
 from gridworld.config.worlds import World, compiled
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
@@ -92,11 +93,30 @@ def without_pictures(config: TrainConfig) -> TrainConfig:
 
 def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
     """What a user should know of the settings before training: where they come from, what they cannot do."""
-    found = [] if (recipe := recipe_note(config, mdp)) is None else [recipe]
+    found = [] if (recipe := _recipe_note(config, mdp)) is None else [recipe]
     if config.known_failure is not None:
         found.append(f"agent={config.agent.name} is known to fail: {config.known_failure}")
     note = objective_note(config, mdp)
     return found if note is None else [*found, note]
+
+
+def _recipe_note(config: TrainConfig, mdp: Mdp) -> str | None:
+    """Which recipe a run has, why, and how to leave it out; or which one would suit it."""
+    agent, recipe = agent_and_recipe(config)
+    size = f"{mdp.name} has {mdp.num_states:,} states"
+    why = f"{mdp.name} is stochastic" if mdp.is_stochastic else size
+    if recipe is None:
+        fitting = recipe_of_class(agent, config, lambda: mdp)
+        return None if fitting is None else f"{why}; for settings that suit it, add {GROUP}={fitting}"
+    own, _, name = recipe.rpartition("/")
+    other = [] if own == agent else ["agent"]
+    is_shipped = (conf_folder() / "env" / f"{name}.yaml").is_file()
+    if is_shipped and name not in config.env.recipes_of and not is_world(config.env, name):
+        other.append("world")
+    reason = f", since {why}" if name in CLASSES else ""
+    reason = f", tuned for another {' and '.join(other)}" if other else reason
+    steps = f"{config.total_timesteps:,} steps"
+    return f"recipe {recipe}{reason}: {steps}; {GROUP}={NONE} keeps the agent's own settings"
 
 
 def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import ArrayLike
 
-from gridworld.base.bounds import discount, positive_int
+from gridworld.base.bounds import Discount, positive_int
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import check_memory
 from gridworld.base.workarounds import blas_threads
@@ -268,7 +268,7 @@ def check_gamma(gamma: float) -> float:
     """A discount as a float, from 0 to 1 and not so near to 1 that the cost of a step is lost in rounding."""
     if isinstance(gamma, bool) or not isinstance(gamma, int | float | np.number) or not 0 <= gamma <= 1:
         raise InputError(f"gamma={gamma!r}: must be a number from 0 to 1")
-    discount("gamma", float(gamma))
+    Discount().check("gamma", float(gamma))
     return float(gamma)
 
 

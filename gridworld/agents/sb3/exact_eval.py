@@ -27,7 +27,7 @@ from gridworld.agents.sb3.policy_outputs import (
     why_unsteady,
 )
 from gridworld.base.atomic_write import replacing, write_bytes
-from gridworld.base.bounds import Bounds, discount
+from gridworld.base.bounds import Bounds, Discount
 from gridworld.base.console import tell
 from gridworld.base.errors import InputError, on_a_line
 from gridworld.config.compose import named_world
@@ -225,7 +225,7 @@ class ExactEvalCallback(BaseCallback):
         """
         super().__init__(verbose)
         Bounds(1).check("every", every)
-        discount("gamma", gamma)
+        Discount().check("gamma", gamma)
         if stop_after is not None:
             Bounds(1).check("stop_after", stop_after)
         self.evaluator: Evaluator | None = None
