@@ -93,12 +93,12 @@ def compose_whole(name: str, words: Sequence[str]) -> DictConfig:
 def compose_run(words: Sequence[str], world: World = compiled) -> tuple[TrainConfig, Chosen, list[str]]:
     """Compose a run's settings with the recipe that fits; what it chooses; the word for that recipe."""
 
-    def again(more: list[str]) -> tuple[TrainConfig, Chosen]:
-        whole = compose_whole("train", [*words, *more])
+    def composed(words: Sequence[str]) -> tuple[TrainConfig, Chosen]:
+        whole = compose_whole("train", words)
         chosen = Chosen.of(whole.hydra)
         return to_config(whole), chosen
 
-    return with_recipe_by_rule(prepared(words), again, world)
+    return with_recipe_by_rule(prepared(words), composed, world)
 
 
 def refuse_unused(own: DictConfig, but: Collection[str] = ()) -> None:

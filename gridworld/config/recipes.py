@@ -69,23 +69,24 @@ class Chosen:
     @property
     def recipe(self) -> str | None:
         """The recipe, if its file exists: a missing one is left out by Hydra."""
-        return self.tuned if self.tuned != NONE and self.has(self.tuned) else None
+        return self.tuned if self.tuned != NONE and self.file(self.tuned) else None
 
     @property
     def is_open(self) -> bool:
         """Whether no experiment chooses the recipe."""
         return self.tuned == f"{self.agent}/{self.env}"
 
-    def has(self, recipe: str) -> bool:
-        """Whether there is such a file."""
-        return any((folder / GROUP / f"{recipe}.yaml").is_file() for folder in self.folders)
+    def file(self, recipe: str) -> Path | None:
+        """The file of a recipe, if there is one."""
+        files = (folder / GROUP / f"{recipe}.yaml" for folder in self.folders)
+        return next(filter(Path.is_file, files), None)
 
     def has_its_sizes(self, config: TrainConfig) -> bool:
-        """Whether what the numbers of a class's recipe rest on is in settings as its file has it."""
-        if self.tuned.rpartition("/")[2] not in CLASSES:
+        """Whether settings have what the numbers of a class's recipe rest on as its file has it."""
+        file = self.file(self.tuned)
+        if file is None or file.stem not in CLASSES:
             return True
-        files = (folder / GROUP / f"{self.tuned}.yaml" for folder in self.folders)
-        content = yaml.safe_load(next(filter(Path.is_file, files)).read_text("utf-8"))
+        content = yaml.safe_load(file.read_text("utf-8"))
         return all(getattr(config, key) == content.get(key, getattr(config, key)) for key in _SIZE)
 
     def check(self) -> None:
@@ -94,7 +95,7 @@ class Chosen:
             if self.is_open and (old := tuned / f"{self.env}_{self.agent}.yaml").is_file():
                 place = f"{tuned / self.tuned}.yaml"
                 raise InputError(f"{old}: a recipe is in its agent's folder; move it to {place}")
-        if self.is_open or self.tuned in (NONE, "None") or self.has(self.tuned):
+        if self.is_open or self.tuned in (NONE, "None") or self.file(self.tuned):
             return
         from gridworld.config.messages import no_such  # here, with Hydra, which takes its time
 
@@ -125,21 +126,21 @@ def agent_and_recipe(config: TrainConfig) -> tuple[str, str | None]:
 
 def with_recipe_by_rule(
     words: Sequence[str],
-    compose: Callable[[list[str]], tuple[TrainConfig, Chosen]],
+    compose: Callable[[Sequence[str]], tuple[TrainConfig, Chosen]],
     world: World = compiled,
 ) -> tuple[TrainConfig, Chosen, list[str]]:
     """Compose a command line, and once more where the rule says another recipe than Hydra brought in.
 
-    `compose` takes words besides `words`. Returns the settings, what is chosen, and the words added.
+    Returns the settings, what is chosen, and the words added.
     """
-    config, chosen = compose([])
+    config, chosen = compose(words)
     chosen.check()
     if chosen.is_open and GROUP not in map(key_of, words):
         for name in _in_order(config, chosen, words, world):
             if name == chosen.recipe:
                 break
             word = f"{GROUP}={name or NONE}"
-            again, others = compose([word])
+            again, others = compose([*words, word])
             if name is None or others.has_its_sizes(again):
                 return others.settle(again, words), others, [word]
     return chosen.settle(config, words), chosen, []
@@ -150,13 +151,13 @@ def _in_order(
 ) -> Iterator[str | None]:
     """The recipes that fit, the best one first; the next one is for where an experiment has its own sizes."""
     names = [f"{chosen.agent}/{name}" for name in (chosen.env, *config.env.recipes_of)]
-    own = next(filter(chosen.has, names), None)
+    own = next(filter(chosen.file, names), None)
     is_changed = any(map(_OTHER_WORLD.match, words)) and not is_world(config.env, chosen.env)
-    is_changed = is_changed and chosen.has(f"{chosen.agent}/{STOCHASTIC}")
+    is_changed = is_changed and chosen.file(f"{chosen.agent}/{STOCHASTIC}") is not None
     if own is not None and not (is_changed and _class_of(lambda: world(config.env)) == STOCHASTIC):
         yield own
     elif not any(key in _SIZE for key in map(key_of, words)):
-        yield recipe_of_class(chosen.agent, config, lambda: world(config.env), chosen.has)
+        yield recipe_of_class(chosen.agent, config, lambda: world(config.env), chosen.file)
     yield None
 
 
@@ -164,10 +165,10 @@ def recipe_of_class(
     agent: str,
     config: TrainConfig,
     world: Callable[[], Mdp],
-    has: Callable[[str], bool] = lambda name: (conf_folder() / GROUP / f"{name}.yaml").is_file(),
+    file: Callable[[str], object] = lambda name: (conf_folder() / GROUP / f"{name}.yaml").is_file(),
 ) -> str | None:
     """The agent's recipe for the world's class; None where it has none, or the settings make no world."""
-    known = [name for name in CLASSES if has(f"{agent}/{name}")]
+    known = [name for name in CLASSES if file(f"{agent}/{name}")]
     if not known or getattr(config.agent, "engine", _ENGINE) != _ENGINE or has_own_code(config.callbacks):
         return None
     name = _class_of(world)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
+import itertools
 import os
 import pkgutil
 import re
@@ -78,9 +79,9 @@ def _walk(schema: type, section: str = "") -> Iterator[tuple[str, Any, dict[type
                 yield from _walk(each, f"{section}{name}.")
 
 
-def _types(schema: type, section: str = "") -> dict[str, Hints]:
+def _types(*schemas: tuple[type, str]) -> dict[str, Hints]:
     found: dict[str, Hints] = {}
-    for name, hint, _ in _walk(schema, section):
+    for name, hint, _ in itertools.chain.from_iterable(itertools.starmap(_walk, schemas)):
         if not (dataclasses.is_dataclass(hint) or hint in found.get(name, ())):
             found[name] = (*found.get(name, ()), hint)
     return found
@@ -89,16 +90,14 @@ def _types(schema: type, section: str = "") -> dict[str, Hints]:
 @functools.cache
 def settings_of_a_run() -> dict[str, Hints]:
     """The types of every setting of a run, of all agents and sources of worlds, by dotted names."""
-    return _types(TrainConfig)
+    return _types((TrainConfig, ""))
 
 
 @functools.cache
 def all_settings() -> dict[str, Hints]:
     """The same, with those of a sweep, its launchers and a search."""
-    found = settings_of_a_run() | _types(TuneConfig, "tune.") | _types(SweepConfig, "hydra.sweeper.")
-    for schema in LAUNCHER_SCHEMAS.values():
-        found |= _types(schema, "hydra.launcher.")
-    return found
+    launchers = ((schema, "hydra.launcher.") for schema in LAUNCHER_SCHEMAS.values())
+    return _types((TrainConfig, ""), (TuneConfig, "tune."), (SweepConfig, "hydra.sweeper."), *launchers)
 
 
 def takes_whole_numbers(name: str) -> bool:

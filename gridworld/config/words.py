@@ -106,8 +106,9 @@ def pairs() -> dict[str, tuple[str, str]]:
     conf = conf_folder()
     envs = [file for file in sorted((conf / "env").glob("*.yaml")) if MISSING not in file.read_text("utf-8")]
     both = itertools.product(envs, sorted((conf / "agent").glob("*.yaml")))
+    studies = {file.stem for file in (conf / "experiment").glob("*.yaml")}
     found = {f"{env.stem}_{agent.stem}": (env.stem, agent.stem) for env, agent in both}
-    return {name: pair for name, pair in found.items() if not (conf / "experiment" / f"{name}.yaml").exists()}
+    return {name: pair for name, pair in found.items() if name not in studies}
 
 
 def refuse_unclear(words: Sequence[str]) -> None:
@@ -128,12 +129,10 @@ def refuse_unclear(words: Sequence[str]) -> None:
         if word[:1] in ("'", '"'):
             raise InputError(f"{word}: is in quotation marks, which the shell passed on; leave them out")
         if "=" not in word and not word.startswith("~"):
-            files = [conf_folder() / group / f"{word}.yaml" for group in groups]
-            choices = [f"write {file.parent.name}={word}" for file in files if word and file.is_file()]
-            choices += (
-                ["write --help"] if word == "help" else ["a setting is written key=value, as in agent=dqn"]
-            )
-            raise InputError(f"{word or 'an empty word'}: is not a setting; {choices[0]}")
+            files = [conf_folder() / group / f"{word}.yaml" for group in groups if word]
+            right = "write --help" if word == "help" else "a setting is written key=value, as in agent=dqn"
+            right = next((f"write {file.parent.name}={word}" for file in files if file.is_file()), right)
+            raise InputError(f"{word or 'an empty word'}: is not a setting; {right}")
 
 
 def _refuse_options(words: Sequence[str]) -> None:

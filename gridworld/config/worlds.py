@@ -113,11 +113,9 @@ class GymnasiumConfig(EnvConfig):
     # that it is registered under, e.g. FrozenLake-v1; or module:NAME of a class or a function that makes one
     id: EnvId = MISSING
     kwargs: Kwargs = setting(dict)  # of gymnasium.make, the class or the function
-    # attributes that are not part of its state, by your word
-    ignore: list[Word] = setting(list)
-    # a search that finds more states is refused
+    ignore: list[Word] = setting(list)  # attributes that are not part of its state, by your word
+    # a search that finds more, or takes longer, is refused
     most_states: int = setting(MOST_STATES, Effect.NOTHING, Bounds(1, 512 * 512))
-    # a search that takes longer is refused
     most_seconds: float = setting(MOST_SECONDS, Effect.NOTHING, Bounds(0, 86_400, above=True))
 
     @property
@@ -129,12 +127,9 @@ class GymnasiumConfig(EnvConfig):
         from gridworld.world.sources.elsewhere import same_elsewhere
         from gridworld.world.sources.environment import compile_id
 
-        how: dict[str, Any] = {
-            "by_table": not (isinstance(self, EnumeratedConfig) or self.ignore),
-            "ignore": list(self.ignore),
-            "most_states": self.most_states,
-            "most_seconds": self.most_seconds,
-        }
+        by_table = not (isinstance(self, EnumeratedConfig) or self.ignore)
+        limits = {"most_states": self.most_states, "most_seconds": self.most_seconds}
+        how: dict[str, Any] = {"by_table": by_table, "ignore": list(self.ignore), **limits}
         began = time.monotonic()
         mdp = compile_id(self.id, self.kwargs, **how)
         return same_elsewhere(mdp, self.id, self.kwargs, time.monotonic() - began, **how)

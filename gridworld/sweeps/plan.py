@@ -229,11 +229,7 @@ def plan(
 
     planned: dict[str, Job] = {}
     for given, swept in jobs:
-
-        def compose(words: list[str], given: list[str] = given) -> tuple[TrainConfig, Chosen]:
-            return configure([*given, *words])
-
-        config, _, added = with_recipe_by_rule(prepared(given), compose, world)
+        config, _, added = with_recipe_by_rule(prepared(given), configure, world)
         said: tuple[str, ...] = ()
         mistake, layout, memory = None, "", 0
         try:

@@ -72,7 +72,7 @@ def configure(*overrides: str) -> TrainConfig:
 
 @functools.lru_cache(maxsize=500)
 def _composed(overrides: tuple[str, ...]) -> TrainConfig:
-    return with_recipe_by_rule(prepared(overrides), lambda added: composed([*overrides, *added]))[0]
+    return with_recipe_by_rule(prepared(overrides), composed)[0]
 
 
 def composed(words: Sequence[str]) -> tuple[TrainConfig, Chosen]:
