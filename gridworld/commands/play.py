@@ -301,7 +301,7 @@ def _game(options: argparse.Namespace) -> Game:
         if saved is not None:
             world = saved.evaluator(options.layout).mdp
             assert isinstance(world, GridMdp)
-            mdp: Mdp = env.compile_on(world.layout)
+            mdp: Mdp = env.compile(world.layout)
         else:
             mdp = dataclasses.replace(env, layout=options.layout or env.layout).compile()
     elif wrong := [*given, *(["layout"] if options.layout is not None else [])]:

@@ -74,7 +74,14 @@ def _file(word: str) -> Path:
 
 def overrides(path: Path, trust: bool = False) -> list[str]:
     """The overrides of a recipe, choices first; with `trust` it may run code and read files."""
-    content = _read(path)
+    text = as_text(read_bytes(path, _LARGEST), path)
+    try:
+        _check_plain(text, path)
+        content: Any = OmegaConf.to_container(OmegaConf.create(text)) if text.strip() else None
+    except InputError:
+        raise
+    except (yaml.YAMLError, ValueError) as error:
+        raise InputError(f"{path}: {not_yaml(error)}") from None
     if not isinstance(content, dict):
         raise InputError(f"{path}: contains no settings")
     choices = list(_choices(content.pop("defaults", []), path))
@@ -82,17 +89,6 @@ def overrides(path: Path, trust: bool = False) -> list[str]:
     if not trust:
         check_foreign(content, str(path), f"{TRUST}=true")
     return [*choices, *values]
-
-
-def _read(path: Path) -> Any:
-    text = as_text(read_bytes(path, _LARGEST), path)
-    try:
-        _check_plain(text, path)
-        return OmegaConf.to_container(OmegaConf.create(text)) if text.strip() else None
-    except InputError:
-        raise
-    except (yaml.YAMLError, ValueError) as error:
-        raise InputError(f"{path}: {not_yaml(error)}") from None
 
 
 def _check_plain(text: str, path: Path) -> None:

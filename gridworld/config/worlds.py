@@ -92,13 +92,11 @@ class MapConfig(EnvConfig):
     def name(self) -> str:
         return self.layout
 
-    def compile(self) -> GridMdp:
+    def compile(self, layout: Layout | None = None) -> GridMdp:
+        """Compile the world, or that of another map with these rewards."""
         from gridworld.world.layout import load
 
-        return self.compile_on(load(self.layout, self.num_rows, self.num_cols, self.rewards))
-
-    def compile_on(self, layout: Layout) -> GridMdp:
-        """Compile the world with this map in place of the configured one."""
+        layout = layout or load(self.layout, self.num_rows, self.num_cols, self.rewards)
         return _compiled(layout, self.slip, self.step_reward, self.goal_reward, self.trap_reward)
 
 

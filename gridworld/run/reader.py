@@ -210,7 +210,7 @@ def stored_world(run: RunReader, env: EnvConfig) -> Mdp:
     text = "\n".join(run.manifest["layout"])
     if isinstance(env, MapConfig):
         layout = parse(text, f"{run.manifest_file}: layout")
-        return env.compile_on(dataclasses.replace(layout, name=env.layout))
+        return env.compile(dataclasses.replace(layout, name=env.layout))
     is_noted = run.world_file.name in run.manifest.get("sha256", {})  # not of an unfinished run
     content = (run.read if is_noted else read_bytes)(run.world_file, LARGEST_RESULT, COPIES)
     mdp = world_from_bytes(content, str(run.world_file))

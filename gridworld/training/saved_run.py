@@ -102,7 +102,7 @@ class SavedRun:
                     f"layout {world.name}: is {world.num_rows}x{world.num_cols}, the agent was trained on "
                     f"{rows}x{columns}; use a map of that size"
                 )
-            mdp = env.compile_on(world)
+            mdp = env.compile(world)
         return Evaluator(mdp, self.config.evaluation.gamma, env.step_limit(mdp))
 
     @limited()
