@@ -102,12 +102,13 @@ def all_settings() -> dict[str, Hints]:
 
 def takes_whole_numbers(name: str) -> bool:
     """Whether a setting of a run, a sweep or a search, or what contains it, consists of whole numbers."""
-    found = False
-    for hint in _at(name, all_settings(), ()):
+
+    def is_whole(hint: Any) -> bool:
         kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
-        if not (found := float not in kinds and (int in kinds or hint == WholeNumbers)):
-            break
-    return found
+        return float not in kinds and (int in kinds or hint == WholeNumbers)
+
+    hints = _at(name, all_settings(), ())
+    return bool(hints) and all(map(is_whole, hints))
 
 
 @functools.cache
