@@ -37,11 +37,9 @@ if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
 VERSION_BASE = "1.3"
 _LONGEST_NAME = 100  # characters of a job's folder
 _ONE_AT_A_TIME = threading.RLock()  # Hydra composes with variables of the process
-_BASIC = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
-_OURS = {  # by their names
-    "launcher": {"basic": _BASIC} | {name: each._target_ for name, each in LAUNCHER_SCHEMAS.items()},
-    "sweeper": {"gridworld": SweepConfig._target_},
-}
+_LAUNCHERS = {name: f"gridworld.sweeps.launchers.{name}" for name in LAUNCHER_SCHEMAS}
+_LAUNCHERS["basic"] = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+_OURS = {"launcher": _LAUNCHERS, "sweeper": {"gridworld": SweepConfig._target_}}  # by their names
 _NO_SINGLE_RUN = {  # with these of Hydra's options, a command line is not that of a run in the shipped `conf`
     *("-m", "--multirun", "--hydra-help", "--info", "-i", "--shell-completion", "-sc"),
     *("--config-name", "-cn", "--config-path", "-cp", "--experimental-rerun"),

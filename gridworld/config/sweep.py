@@ -49,12 +49,12 @@ class SlurmConfig:
     array_parallelism: int = setting(256, Bounds(1))
     timeout_min: int = setting(60, Bounds(1))
     signal_delay_s: int = setting(60, Bounds(1))
-    cpus_per_task: int = setting(1, Bounds(1))
+    cpus_per_task: int = setting(1, Bounds(1))  # cores
     mem_gb: float | None = None
-    partition: str | None = None
-    account: str | None = None
-    qos: str | None = None
-    constraint: str | None = None
+    partition: str | None = None  # of Slurm's, and so below; null: the default
+    account: str | None = None  # that pays
+    qos: str | None = None  # quality of service
+    constraint: str | None = None  # features that a node must have
     setup: list[str] = setting(list)
     more: dict[str, Any] = setting(dict)
 
@@ -68,12 +68,7 @@ class RayConfig:
     remote: dict[str, Any] = setting(dict)
 
 
-LAUNCHER_SCHEMAS: dict[str, type[Any]] = {
-    "forks": ForksConfig,
-    "joblib": JoblibConfig,
-    "slurm": SlurmConfig,
-    "ray": RayConfig,
-}
+LAUNCHER_SCHEMAS = {"forks": ForksConfig, "joblib": JoblibConfig, "slurm": SlurmConfig, "ray": RayConfig}
 
 
 @dataclass
@@ -92,7 +87,7 @@ class DimensionConfig:
 class TuneConfig:
     """How `scripts/tune.py` searches; conf/tune.yaml says what each setting is."""
 
-    trials: int = setting(100, Bounds(1))
+    trials: int = setting(100, Bounds(1))  # the search ends after so many
     seeds: int = setting(3, Bounds(1, _MOST_RUNS))
     finalists: int = setting(5, Bounds(1, _MOST_RUNS))
     final_seeds: int = setting(10, Bounds(0, _MOST_RUNS))
@@ -103,9 +98,9 @@ class TuneConfig:
     workers: int = setting(-1, Bounds(-1))
     together: int | None = setting(None, Bounds(1))
     timeout: float | None = setting(None, Bounds(0, above=True))
-    sampler: str = "tpe"
-    sampler_seed: int = setting(0, Bounds(0))
-    pruner: str = "median"
+    sampler: str = "tpe"  # or random
+    sampler_seed: int = setting(0, Bounds(0))  # of the search itself
+    pruner: str = "median"  # or hyperband, none
     evaluations: int = setting(50, Bounds(1, _MOST_LOOKS))
     reports: int = setting(10, Bounds(1, _MOST_LOOKS))
     stop_after: int | None = setting(3, Bounds(1))

@@ -116,7 +116,7 @@ class EvaluationConfig:
 class LoggingConfig:
     """What is logged while training."""
 
-    tensorboard: bool = True
+    tensorboard: bool = True  # write an event file
     policy_map_every: int = setting(5, Bounds(0))
     progress: bool = setting(True, Effect.NOTHING)
     wandb: Contact = setting(False, Effect.NOTHING)
@@ -155,7 +155,7 @@ class RecordingConfig:
     gif: bool = setting(True, Picture("episode.gif", "episode.episode"))
     mp4: bool = setting(False, Picture("episode.mp4", "episode.episode"))
     cell_size: int | None = setting(None, Bounds(2))
-    fps: int = setting(4, Bounds(1, 100))
+    fps: int = setting(4, Bounds(1, 100))  # frames a second
 
 
 PICTURES: tuple[Picture, ...] = tuple(
@@ -186,7 +186,7 @@ class TrainConfig:
     # b of b / sqrt(N), added to a reward of training for an action that was taken there N times; 0 for none
     exploration_bonus: float = setting(0.0, Bounds(0, MOST_BONUS))
     exploring_starts: float = setting(0.0, Privilege("starts anywhere"), Bounds(0, 1))
-    # see `gridworld.envs.vector_env`
+    # whether environments in one state share out an action's outcomes evenly, see `gridworld.envs.vector_env`
     stratified_draws: bool = setting(False, Privilege("stratified draws"))
     device: Word = setting("cpu", Effect.MACHINE)
     threads: int = setting(1, Effect.MACHINE, Bounds(1, MOST_THREADS))  # of torch

@@ -10,7 +10,7 @@ import functools
 import re
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, make_dataclass
+from dataclasses import asdict, dataclass
 from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -112,8 +112,9 @@ class GymnasiumConfig(EnvConfig):
     id: EnvId = MISSING
     kwargs: Kwargs = setting(dict)  # of gymnasium.make, the class or the function
     ignore: list[Word] = setting(list)  # attributes that are not part of its state, by your word
-    # a search that finds more, or takes longer, is refused
+    # a search that finds more states is refused
     most_states: int = setting(MOST_STATES, Effect.NOTHING, Bounds(1, 512 * 512))
+    # a search that takes longer is refused
     most_seconds: float = setting(MOST_SECONDS, Effect.NOTHING, Bounds(0, 86_400, above=True))
 
     @property
@@ -197,19 +198,39 @@ class ClassicConfig(EnvConfig):
             raise InputError(f"env.{error}") from None
 
 
-def _classic(source: str, **sizes: int | None) -> type[ClassicConfig]:
-    """The schema of a world of the literature, with the defaults of its sizes; null: not given."""
-    fields = [(name, int | None if size is None else int, size) for name, size in sizes.items()]
-    namespace = {"__module__": __name__}
-    return make_dataclass(
-        source, [("source", Word, source), *fields], bases=(ClassicConfig,), namespace=namespace
-    )
+@dataclass
+class RiverSwimConfig(ClassicConfig):
+    """Against the current to a large reward, or with it to a small one."""
+
+    source: Word = "river_swim"
+    length: int = 6  # states
 
 
-river_swim = _classic("river_swim", length=6)  # states
-deep_sea = _classic("deep_sea", size=10, seed=None)  # rows and columns; of what the actions mean in each cell
-combination_lock = _classic("combination_lock", length=10, num_actions=2, seed=None)  # of the combination
-random_walk = _classic("random_walk", length=5)  # states without the ends, an odd number
+@dataclass
+class DeepSeaConfig(ClassicConfig):
+    """One way of 2 ** size leads to the treasure."""
+
+    source: Word = "deep_sea"
+    size: int = 10  # rows and columns
+    seed: int | None = None  # of what the actions mean in each cell; null: left and right
+
+
+@dataclass
+class CombinationLockConfig(ClassicConfig):
+    """A wrong action leads back to the start."""
+
+    source: Word = "combination_lock"
+    length: int = 10  # actions that open it
+    num_actions: int = 2  # of each state
+    seed: int | None = None  # of the combination; null: the last action everywhere
+
+
+@dataclass
+class RandomWalkConfig(ClassicConfig):
+    """A chain whose right end pays 1."""
+
+    source: Word = "random_walk"
+    length: int = 5  # states without the ends, an odd number
 
 
 @functools.lru_cache(maxsize=4, typed=True)  # the jobs of a sweep have few worlds
@@ -246,11 +267,8 @@ def schema_of(content: Any) -> type[EnvConfig]:
     return SOURCES.get(source, MapConfig) if isinstance(source, str) else MapConfig
 
 
-SOURCES: dict[str, type[EnvConfig]] = {
-    "map": MapConfig,
-    "gymnasium": GymnasiumConfig,
-    "enumerated": EnumeratedConfig,
-    "arrays": ArraysConfig,
-    "built": BuiltConfig,
-    **{schema.source: schema for schema in (river_swim, deep_sea, combination_lock, random_walk)},
-}
+_SCHEMAS: tuple[type[EnvConfig], ...] = (
+    *(MapConfig, GymnasiumConfig, EnumeratedConfig, ArraysConfig, BuiltConfig),
+    *(RiverSwimConfig, DeepSeaConfig, CombinationLockConfig, RandomWalkConfig),
+)
+SOURCES = {str(getattr(schema, "source", "map")): schema for schema in _SCHEMAS}
