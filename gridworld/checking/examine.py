@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import textwrap
 import time
@@ -19,13 +20,14 @@ from gridworld.base.bounds import STEP_LIMIT, Bounds, Discount
 from gridworld.base.errors import GYMNASIUM, InputError, in_short, on_a_line
 from gridworld.checking.function import SingleEnv
 from gridworld.checking.sampling import Actions, Env, Replays, generators_restored, replays, sample
-from gridworld.checking.seen import ERROR, EnvFinding, Seen
+from gridworld.checking.seen import ERROR, UNLIMITED, EnvFinding, Seen
 from gridworld.checking.symptoms import ALL
 from gridworld.config.compose import named_world
 from gridworld.config.worlds import is_id
 from gridworld.envs.inspection import task_of
 from gridworld.envs.observations import make_observation
 from gridworld.envs.vector_env import GridWorldVectorEnv
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 from gridworld.world.metrics import wilson_interval
 from gridworld.world.sources.elsewhere import same_elsewhere
@@ -233,9 +235,8 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
     at_random = steps.last[steps.at_random[steps.last]]
     if seen.reach is not None:
         likely, away = seen.reach
-        how_often = "every episode" if likely == 1 else f"{_percent(likely, 3)} of its episodes"
         soonest = f"{away:,} step{'s' * (away > 1)} away at the soonest"
-        yield "random policy", f"comes to {seen.worth}, {soonest}, in {how_often} (exact)"
+        yield "random policy", f"comes to {seen.worth}, {soonest}, in {_episodes(likely)} (exact)"
     elif is_usual and seen.paid.any() and len(at_random):
         hits = len(np.unique(steps.episode[steps.at_random & seen.paid]))
         low, high = wilson_interval(hits, len(at_random))
@@ -248,6 +249,18 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
         returns = np.bincount(steps.episode, steps.reward)[steps.episode[at_random]]
         found = f"returns {returns.mean():.4g} on average (deviation {returns.std():.3g})"
         yield "random policy", f"{found} in {len(at_random):,} sampled episodes"
+    if mdp is not None:
+        with contextlib.suppress(InputError):  # there is no finite optimum
+            best = Evaluator(mdp, seen.gamma, seen.limit or UNLIMITED).optimum
+            earned, length = best.expected_return + 0.0, best.expected_length
+            earned = f"returns {earned:.4g} in {length:.4g} step{'s' * (length != 1)}"
+            ends = f"terminates in {_episodes(1 - best.timeout)}"
+            yield "best policy", f"{earned}, and {ends} (exact, for gamma={seen.gamma:g})"
+
+
+def _episodes(share: float) -> str:
+    some = f"{_percent(share, 3)} of its episodes"
+    return {0.0: "none of its episodes", 1.0: "every episode"}.get(share, some)
 
 
 def _percent(share: float, decimals: int) -> str:

@@ -31,6 +31,10 @@ _LOOKED_AT, _NAMED = 12, 3  # states that are compared by their attributes; attr
 _LEAST = 5  # conflicts, at least, that a cause must explain
 _TIME, _RESET, _BEFORE = "the step count", "what is drawn at reset", "the step before"
 _PAST = "more of the past than the step before"
+_LATE = (
+    " The first step of each episode shows what reset() showed: if it should not, make the observation after "
+    "the state changes."
+)
 _ADVICE = {
     _TIME: "add the time to the observation (gymnasium.wrappers.TimeAwareObservation).",
     _RESET: "show {}, which reset() chooses, e.g. the place of the goal.",
@@ -41,11 +45,25 @@ _ADVICE = {
 
 def hidden(seen: Seen) -> tuple[str, str] | None:
     """The evidence and the advice; None where nothing is found."""
-    known = seen.refusal if seen.mdp is None else seen.mdp.truth
+    known, steps = seen.refusal if seen.mdp is None else seen.mdp.truth, seen.steps
     found = _by_states(seen) if re.search(_ALIASED, known) else None
-    if found or seen.mdp is not None:
-        return found
-    return None if seen.steps.draws else _by_conflict(seen)
+    if not (found or seen.mdp is not None or steps.draws):
+        found = _by_conflict(seen)
+    if found and _BEFORE in found[0] and (steps.after == steps.before)[steps.first].all():
+        found = found[0], found[1] + _LATE
+    return found
+
+
+def pays_totals(seen: Seen) -> bool:
+    """Whether rewards are sums so far: what they grow by follows from the step as it is seen, they do not."""
+    steps = seen.steps
+    earlier = np.where(steps.time == 0, 0.0, np.append(0.0, steps.reward[:-1]))
+    step = _numbers(steps.before, steps.action, steps.after)
+    total, own = (
+        _several(step, np.unique(np.round(each, 9), return_inverse=True)[1])
+        for each in (steps.reward, steps.reward - earlier)
+    )
+    return bool(total.sum() >= _LEAST and not own.any())
 
 
 def _by_states(seen: Seen) -> tuple[str, str] | None:

@@ -41,6 +41,7 @@ from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 Env = gym.Env[Any, Any]
 Play = list[tuple[bytes, float, bool, bool]]  # observation, reward, terminated, truncated; of reset first
+Held = tuple[dict[str, bytes], dict[str, bytes]]  # the content of attributes, and of what is held in them
 LONGEST = 5_000  # steps of an episode, then it is given up
 SEEDS = range(3)  # of replays
 _HORIZON = 100  # steps of a replay
@@ -95,6 +96,7 @@ class Replays:
     causes: list[str] = field(default_factory=list)  # what it draws from besides `np_random`
     survivors: list[str] = field(default_factory=list)  # attributes that a reset does not restore
     after: str = "other"  # the episodes after which it does not
+    shared: list[str] = field(default_factory=list)  # attributes that another environment changes
     plays: list[list[Play]] = field(default_factory=list)
 
 
@@ -229,6 +231,7 @@ def replays(make: Callable[[], Env], actions: Actions, sampled: Steps, rate: flo
             own = [name for name, _ in all_generators(env) if name.startswith(_ITS)]
             found.causes += [name for name in own if name not in found.causes]
     elif not found.causes:
+        found.shared = _shared(make, lists[0], base[0][0])
         _try_ends(found, make, sampled, _ENDED * rate, (lists[0], base[0][0]))
     found.repeats = base == again == new and not found.causes and not found.survivors
     if base == new:
@@ -260,26 +263,58 @@ def _try_ends(found: Replays, make: Callable[[], Env], sampled: Steps, left: flo
 
 def _survivors(fresh: Env, used: Env) -> list[str]:
     """The attributes that a reset leaves as an earlier episode made them; "" for one that is not found."""
-    keys, inner = [], []
+
+    def held(env: Env) -> Held:
+        seed_all(env, 1)
+        env.reset(seed=SEEDS[0])
+        return _held(env)
+
+    return _changed(lambda: held(fresh), lambda: held(used))
+
+
+def _shared(make: Callable[[], Env], actions: list[Any], usual: Play) -> list[str]:
+    """The attributes of an environment that another one changes; none where an episode stays as it is."""
+    env, other = make(), make()
+
+    def after_another() -> Held:
+        other.reset(seed=SEEDS[1])
+        other.step(copy.copy(actions[0]))
+        return _held(env)
+
+    if _play(env, actions, SEEDS[0], set(), beside=other) == usual:
+        return []
+    return _changed(lambda: _held(env), after_another)
+
+
+def _held(env: Env) -> Held:
+    inner = {name: content(each) for name, each in held_by(env.unwrapped) if is_plain(each)}
+    return contents(env.unwrapped), inner
+
+
+def _changed(before: Callable[[], Held], after: Callable[[], Held]) -> list[str]:
+    """The names of what an environment holds that differ; "" where none is found."""
     try:
-        for env in (fresh, used):
-            seed_all(env, 1)
-            env.reset(seed=SEEDS[0])
-            keys.append(contents(env.unwrapped))
-            inner.append({name: content(each) for name, each in held_by(env.unwrapped) if is_plain(each)})
+        names, inner = map(differing, before(), after())
     except Exception:  # whatever cannot be copied
         return [""]
-    names = differing(*keys)
-    return innermost(names, differing(*inner)) or [""]
+    return innermost(names, inner) or [""]
 
 
-def _play(env: Env, actions: Sequence[Any], seed: int, drawn: set[str], other: str = "") -> Play:
-    """Play with known seeds, of the generator `other` with another; `drawn` gets those that it draws from."""
+def _play(
+    env: Env, actions: Sequence[Any], seed: int, drawn: set[str], other: str = "", beside: Env | None = None
+) -> Play:
+    """Play with known seeds, of the generator `other` with another; `drawn` gets those that it draws from.
+
+    An environment `beside` it begins an episode before each step.
+    """
     generators = seed_all(env, 1, other)
     before = [_state(each) for _, each in generators]
     observation, _ = env.reset(seed=seed)
     found: Play = [(content(observation), 0.0, False, False)]
     for action in actions:
+        if beside is not None:
+            beside.reset(seed=SEEDS[1])
+            beside.step(copy.copy(action))
         observation, reward, terminated, truncated, _ = env.step(copy.copy(action))
         found.append((content(observation), float(reward), bool(terminated), bool(truncated)))
         if terminated or truncated:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from gymnasium import spaces
 
-from gridworld.checking.hidden import hidden
+from gridworld.checking.hidden import hidden, pays_totals
 from gridworld.checking.sampling import LONGEST, parts_of
 from gridworld.checking.seen import ENDINGS, ERROR, UNLIMITED, WARNING, EnvFinding, Seen
 from gridworld.world.metrics import wilson_interval
@@ -90,6 +90,14 @@ def _seed(seen: Seen) -> Iterator[EnvFinding]:
         evidence = f"{same}: it draws from {causes}, which reset(seed=...) does not seed."
         advice = "draw from self.np_random, and call super().reset(seed=seed) in reset()."
         yield EnvFinding("seed", WARNING, evidence, advice)
+    if seen.replays.shared:
+        names = ", ".join(filter(None, seen.replays.shared)) or "something"
+        evidence = (
+            f"another environment changes this one: they share {names}, as of a class, a module or a default "
+            "argument."
+        )
+        advice = "make it anew in __init__(); a batch has several environments, and so has an evaluation."
+        yield EnvFinding("reset", ERROR, evidence, advice)
 
 
 def _ends(seen: Seen) -> Iterator[EnvFinding]:
@@ -267,7 +275,14 @@ def _observation(seen: Seen) -> Iterator[EnvFinding]:
 
 def _markov(seen: Seen) -> Iterator[EnvFinding]:
     """Whether what follows is determined by the observation and the action."""
-    is_known = seen.is_constant or seen.replays.survivors
+    if is_total := pays_totals(seen):
+        evidence = (
+            "rewards are totals: observation, action and next observation determine what is added to the "
+            "reward of the step before, but not the reward itself."
+        )
+        advice = "return what this step alone earned; learners add rewards up."
+        yield EnvFinding("reward", ERROR, evidence, advice)
+    is_known = seen.is_constant or seen.replays.survivors or is_total
     if not is_known and (found := hidden(seen)) is not None:
         yield EnvFinding("markov", WARNING, *found)
 

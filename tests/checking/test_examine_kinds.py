@@ -613,3 +613,122 @@ def test_a_mask_of_one_row_is_a_mask() -> None:
     result = examine(Mask, steps=STEPS)
     assert result.passed, str(result)
     assert "can be reached" in fact(result, "states")
+
+
+class SharedRobot(Walk):
+    """All environments move the robot of a default argument."""
+
+    def __init__(self, robot: Robot = Robot()) -> None:  # noqa: B008
+        super().__init__()
+        self.robot = robot
+
+    def reset(self, **kwargs: Any) -> Start:
+        super().reset(**kwargs)
+        self.robot.place = 0
+        return self.show(), {}
+
+    def move(self, action: Any) -> None:
+        self.place = self.robot.place
+        super().move(action)
+        self.robot.place = self.place
+
+
+class SharedList(Walk):
+    """Where it is the class holds."""
+
+    visited: ClassVar[list[int]] = []
+
+    def reset(self, **kwargs: Any) -> Start:
+        self.visited[:] = [0]
+        return super().reset(**kwargs)
+
+    def move(self, action: Any) -> None:
+        self.place = self.visited[-1]
+        super().move(action)
+        self.visited.append(self.place)
+
+
+class OwnRobot(SharedRobot):
+    def __init__(self) -> None:
+        super().__init__(Robot())
+
+
+@pytest.mark.parametrize(
+    ("env", "named"), [(SharedRobot, "robot.place"), (SharedList, "something"), (OwnRobot, "")]
+)
+def test_environments_that_change_each_other_are_found(env: Any, named: str) -> None:
+    result = examine(env, steps=STEPS)
+    assert (f"they share {named}, as of a class" in evidence(result, "reset")) == bool(named), str(result)
+
+
+class PaysTotals(Walk):
+    """Pays at each step what the episode has earned so far."""
+
+    def reset(self, **kwargs: Any) -> Start:
+        self.total = 0.0
+        return super().reset(**kwargs)
+
+    def earn(self, action: Any) -> float:
+        return super().pay(action) - 0.1
+
+    def pay(self, action: Any) -> float:
+        self.total += self.earn(action)
+        return self.total
+
+
+class PaysTotalsWithSlip(PaysTotals):
+    slip = 0.2
+
+
+class PaysWithNoise(PaysTotals):
+    """Its rewards are not a function of the step either, but no totals."""
+
+    def pay(self, action: Any) -> float:
+        return self.earn(action) + float(self.np_random.integers(3))
+
+
+@pytest.mark.parametrize(("env", "found"), [(PaysTotals, 1), (PaysTotalsWithSlip, 1), (PaysWithNoise, 0)])
+def test_rewards_that_are_totals_are_found(env: Any, found: int) -> None:
+    result = examine(env, steps=STEPS)
+    assert ("rewards are totals" in evidence(result, "reward")) == found, str(result)
+    assert result.topics == ["reward"] * found
+
+
+class Late(Walk):
+    """Shows where it was before the step."""
+
+    def step(self, action: Any) -> Result:
+        before = self.show()
+        return before, *super().step(action)[1:]
+
+
+def test_an_observation_of_before_the_step_is_named() -> None:
+    (found,) = examine(Late, steps=STEPS).findings
+    assert "depend on the step before (place)" in found.evidence
+    assert found.advice.endswith("if it should not, make the observation after the state changes.")
+
+
+class PaysTheWay(Walk):
+    """Each step to the right pays, and so does going back and forth, for ever."""
+
+    size = 4
+
+    def pay(self, action: Any) -> float:
+        return 0.1 * bool(action) + self.over()
+
+
+class PunishesSuccess(Walk):
+    def pay(self, action: Any) -> float:
+        return -float(self.over())
+
+
+@pytest.mark.parametrize(
+    ("env", "words"),
+    [
+        (Walk, "returns 1 in 5 steps, and terminates in every episode"),
+        (PaysTheWay, "returns 2.1 in 40 steps, and terminates in none of its episodes"),  # 21 go right
+        (PunishesSuccess, "returns 0 in 40 steps, and terminates in none of its episodes"),
+    ],
+)
+def test_what_the_best_policy_does_is_said(env: Any, words: str) -> None:
+    assert fact(examine(env, steps=STEPS), "best policy") == f"{words} (exact, for gamma=0.99)"
