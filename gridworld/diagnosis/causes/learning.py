@@ -30,7 +30,9 @@ _MOVES = 0.1  # Adam moves a weight by about the learning rate an update: less t
 _MOST_TIMES = 50  # as long
 _EVENLY = "n_envs=256 exploring_starts=1 stratified_draws=true"  # what leaves least to chance
 _GRADIENT = 1e-3  # what each weight's gradient should have without an optimiser that scales it
-_FEW_UPDATES = 500  # of a network: fewer are too few whatever its target
+_FEW_UPDATES = 500  # of a network: fewer are too few whatever its target or its rate
+_FAST = 4  # times the usual rate
+_FEW_ROLLOUTS = 10  # after each of which a policy is improved
 _REFRESHES = 2  # of the target network, for each step of the way to the goal
 
 
@@ -101,6 +103,19 @@ def hardly_moved(run: Evidence) -> Finding | None:
     return Finding("slow", run.split.wrong, why, (*starts, *faster(run)))
 
 
+def rarely_improved(run: Evidence) -> Finding | None:
+    """A policy that changes between rollouts only, of which there were few."""
+    rollouts = run.steps / run.rollout
+    if not run.is_actor_critic or rollouts >= _FEW_ROLLOUTS or _too_short(run, run.split.wrong):
+        return None
+    why = (
+        f"it was still learning: its policy was improved {rollouts:.0f} times, once per {run.rollout:,} steps"
+    )
+    shorter = max(2, run.setting("n_steps") // 8, run.setting("batch_size") // run.config.n_envs)
+    often = (run.change("n_steps", shorter),) if shorter < run.setting("n_steps") else ()
+    return Finding("slow", run.split.wrong, why, (*often, longer(run, 10)))
+
+
 def overshot(run: Evidence) -> Finding | None:
     """A policy that is far more decided than its entropy bonus would leave it."""
     bonus = run.last_setting("ent_coef")
@@ -133,16 +148,23 @@ def not_there_yet(run: Evidence) -> Finding | None:
         return short
     if run.is_tabular:
         return _slow_table(run, states)
-    interval = run.setting("target_update_interval")
-    refreshed = run.config.total_timesteps / max(interval, 1.0) if run.setting("tau", 1.0) == 1 else np.inf
+    interval, tau = run.setting("target_update_interval"), run.setting("tau", 1.0)
+    refreshed = run.config.total_timesteps / max(interval, 1.0)
     path = run.evaluator.optimum.expected_length
-    if interval and run.updates >= _FEW_UPDATES and refreshed < _REFRESHES * path:
+    if interval and run.updates >= _FEW_UPDATES and tau * refreshed < _REFRESHES * path:
+        by, whole = (f" by {percent(tau)}", f" {run.change('tau', 1.0)}") if tau < 1 else ("", "")
         why = (
-            f"its target network was refreshed {refreshed:.0f} times, but a value needs {path:.0f} "
-            "refreshes to travel from the goal to the start"
+            f"its target network was refreshed {refreshed:.0f} times{by}, but a value needs {path:.0f} "
+            f"{'whole ' * (tau < 1)}refreshes to travel from the goal to the start"
         )
-        often = max(1.0, round(run.config.total_timesteps / (8 * path)))
-        return Finding("target", states, why, (run.change("target_update_interval", often), longer(run, 4)))
+        often = run.change("target_update_interval", max(1.0, round(run.config.total_timesteps / (8 * path))))
+        return Finding("target", states, why, (often + whole, longer(run, 4)))
+    rate = run.setting("learning_rate")
+    if run.is_actor_critic and run.updates >= _FEW_UPDATES and rate > _FAST * run.usual_rate:
+        why = (
+            f"its updates are too large: after {run.updates:,.0f} at a learning rate of {rate:g}, its policy"
+        )
+        return Finding("rate", states, f"{why} is hardly decided", slower(run))
     why = f"it was still learning: {run.updates:,.0f} updates were too few"
     return Finding("slow", states, why, faster(run))
 
