@@ -299,13 +299,15 @@ class Probe:
 
 
 _NO_EXPLORATION_LEFT = {"exploration_final_eps": 0.0}
-_BASIC = ("choice", "context", "termination", "discount")  # what worlds of several steps rest on
+_ONE_STEP = ("constant", "choice", "context")  # what all others rest on
+_BASIC = (*_ONE_STEP, "termination", "discount")  # what worlds of several steps rest on
 
 # fmt: off
 PROBES = (
     Probe("constant", CONSTANT, values,
           "values are not learned at all: check the loss, the optimiser and the reward that reaches it; too "
-          "large, they are bootstrapped past the end of an episode"),
+          "large, they are bootstrapped past the end of an episode, or the policy's loss moves them too (its "
+          "advantage must be detached)"),
     Probe("choice", BANDIT, optimal,
           "worse actions are preferred: the advantage's sign is wrong, or rewards go to the wrong actions"),
     Probe("context", TWO_CONTEXTS, optimal,
@@ -324,33 +326,34 @@ PROBES = (
           needs="exploration_final_eps"),
     Probe("termination", END_LIKE_THE_START, optimal_with_values,
           "values are bootstrapped past the end of an episode: the terminal flag is ignored",
-          gamma=0.95, follows=("choice", "context")),
+          gamma=0.95, follows=_ONE_STEP),
     Probe("entropy", DEAR_CONTEXTS, soft_optimal,
           "the entropy bonus does not match its coefficient (wrong sign or scale, missing, or not of each "
           "state's policy), or advantages leak from one episode into another",
-          arguments={"ent_coef": BONUS}, needs="ent_coef", follows=("choice", "context", "termination")),
+          arguments={"ent_coef": BONUS}, needs="ent_coef", follows=(*_ONE_STEP, "termination")),
     Probe("discount", CORRIDOR, optimal_with_values,
           "gamma is ignored or applied at the wrong step, or a reward is credited to another step",
-          gamma=0.5, needs="gamma", follows=("choice", "context", "termination")),
+          gamma=0.5, needs="gamma", follows=(*_ONE_STEP, "termination")),
     Probe("truncation", CUT_SHORT, optimal,
           "a step limit is treated as termination: the value of the last state is missing, or hidden by what "
           "leaks from the next episode",
-          gamma=0.8, follows=("choice", "context", "termination")),
+          gamma=0.8, follows=(*_ONE_STEP, "termination")),
     Probe("leak", CUT_SHORT, values_if_optimal,
           "values or advantages leak from one episode into another: after a step limit, the next episode's "
           "count as if it continued this one",
-          gamma=0.8, follows=("termination", "discount")),
+          gamma=0.8, follows=("constant", "termination", "discount")),
     Probe("delay", DELAY, optimal_with_values,
           "credit does not reach earlier steps: returns, traces or next observations are off by a step",
-          follows=("choice", "context", "discount")),
+          follows=(*_ONE_STEP, "discount")),
     Probe("stochastic", GAMBLE, optimal_with_values,
           "it does not learn the mean of a random reward, but an extreme, its median or its last draw",
-          follows=("choice", "termination")),
+          follows=("constant", "choice", "termination")),
     Probe("alternation", ALTERNATION, optimal_with_values,
           "the value of the next state is wrong: another state's, or not that of its best action",
           gamma=0.8, follows=(*_BASIC, "truncation", "leak", "delay")),
     Probe("trap", TRAP, optimal_with_values,
-          "the next reward counts for more than the return: later rewards are not added, or costs are lost",
+          "the next reward counts for more than the return: later rewards are not added, costs are lost, or "
+          "the value of the next state is not that of its best action",
           follows=(*_BASIC, "delay")),
     Probe("costs", COSTS_AND_LARGE, optimal_with_values,
           "values below 0 are lost (the largest is searched from 0, the output is never negative, or targets "
@@ -365,6 +368,6 @@ PROBES = (
     Probe("target", ENDLESS, first_backup,
           "targets are not computed with the target network: it is never updated, or lags behind",
           gamma=0.8, arguments={"target_update_interval": 10_000_000}, needs="target_update_interval",
-          follows=("discount", "truncation")),
+          follows=("constant", "discount", "truncation")),
 )
 # fmt: on

@@ -183,6 +183,8 @@ def q_learning(env: Any, steps: int, seed: int, gamma: float, bug: str) -> np.nd
             reward = np.clip(reward, -1, 1)
         if bug == "mean":
             reward -= mean
+        if bug == "double":
+            reward *= 2
         over = terminated or (truncated and bug == "limits")
         best = max(0.0, q[following].max()) if bug == "best" else q[following].max()
         target = reward + (0.0 if over else gamma * best)
@@ -243,6 +245,15 @@ def test_a_function_in_a_file_is_found_by_other_processes_too(
     monkeypatch.setattr(sys, "path", list(sys.path))
     result = gridworld.check("random.py:train", probes=["choice", "delay"], processes=2)
     assert [each.name for each in result.findings] == ["choice", "delay"]
+
+
+def test_what_fails_in_one_step_is_mended_first() -> None:
+    result = gridworld.check(
+        lambda env, steps, seed, gamma: {"q": q_learning(env, steps, seed, gamma, "double")},
+        probes=["constant", "choice", "discount", "trap"],
+    )
+    assert result.failed == ["constant", "discount", "trap"]
+    assert [each.may_follow_from for each in result.findings] == [(), (), ("constant",), ("constant",)]
 
 
 PLUGIN = """
