@@ -19,11 +19,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from gridworld.checking.seen import Seen
-from gridworld.world.door import limits
 from gridworld.world.door.attributes import differing, held_by, is_plain
-from gridworld.world.door.observations import content
+from gridworld.world.door.counters import counted
 from gridworld.world.door.search import Search, State
 from gridworld.world.mdp import BoolArray, IntArray
+from gridworld.world.shown import content
 
 _MOST_STATES, _SECONDS = 20_000, 10.0  # of a search
 _ALIASED = "its observations|observations stand for"  # in what is known of a world with beliefs
@@ -74,7 +74,7 @@ def _by_states(seen: Seen) -> tuple[str, str] | None:
         search.explore()
     except Exception:  # its code may be anybody's
         return None
-    known = (limits.met(search), seen.ends_at and seen.ends_at - 1, len(search.states))
+    known = (counted(search), seen.ends_at and seen.ends_at - 1, len(search.states))
     limit = min(each for each in known if each is not None)
     states = [each for each in search.states if each.steps and each.depth < limit]
     entered = [(-1, -1, each) for each in search.resets.starts]

@@ -35,9 +35,9 @@ from gridworld.world.door.attributes import (
     spaces_in,
     state_of,
 )
-from gridworld.world.door.observations import content
-from gridworld.world.door.traits import contents
+from gridworld.world.door.world import contents
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
+from gridworld.world.shown import content
 
 Env = gym.Env[Any, Any]
 Play = list[tuple[bytes, float, bool, bool]]  # observation, reward, terminated, truncated; of reset first

@@ -27,8 +27,7 @@ from gridworld.envs.observations import KINDS, ObservationTable, TableObservatio
 from gridworld.envs.rendering import frame_size
 from gridworld.world.door import known
 from gridworld.world.door.attributes import layers_of
-from gridworld.world.door.traits import traits
-from gridworld.world.door.world import Found
+from gridworld.world.door.world import Found, traits
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import Layout, load
 from gridworld.world.mdp import Mdp

@@ -82,7 +82,7 @@ def set_attributes(thing: Any, held: dict[str, Any]) -> None:
     slots = _slots(kind_of(thing))
     if hasattr(thing, "__dict__"):
         vars(thing).clear()
-        vars(thing).update({name: value for name, value in held.items() if name not in slots})
+        vars(thing).update({k: v for k, v in held.items() if k not in slots} if slots else held)
     for name in slots:
         if name in held:
             object.__setattr__(thing, name, held[name])

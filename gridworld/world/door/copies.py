@@ -23,8 +23,12 @@ ATOMS = frozenset({type(None), bool, int, float, complex, str, bytes, *np.sctype
 _CONTAINERS = (list, tuple, dict, set, frozenset, np.ndarray)  # whose own reduction holds their items
 
 
-class ViewsShared(BaseException):  # which an environment's `except Exception` does not catch
-    """Two arrays show the same memory, so that a copy has to hold it once."""
+class Anew(BaseException):  # which an environment's `except Exception` does not catch
+    """Copies have to be made in another way, so that a search begins anew; `how`: see `Layers`."""
+
+    def __init__(self, **how: bool) -> None:
+        super().__init__(how)
+        self.how = how
 
 
 class Copier(pickle.Pickler):
@@ -51,7 +55,7 @@ class Copier(pickle.Pickler):
                 return _parts_of_view(obj) if isinstance(obj.base, np.ndarray) else NotImplemented
             views = self._views.setdefault(id(obj if obj.base is None else obj.base), [])
             if any(np.may_share_memory(obj, each) for each in views):
-                raise ViewsShared
+                raise Anew(keeps_views=True)  # two arrays of one memory, which a copy has to hold once
             views.append(obj)
         elif _is_taken_apart(kind_of(obj)):
             held = attributes(obj)

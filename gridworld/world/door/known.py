@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
+from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import wrappers
 from gymnasium.utils import seeding
+
+from gridworld.base.errors import InputError
 
 Named = tuple[str, tuple[str, int, int] | None]  # what a reader calls a state, and its place
 # Wrappers that change neither what is seen nor what happens; the second row is of others, if imported.
@@ -150,17 +156,72 @@ _PATCHES: tuple[tuple[tuple[str, str], str, Callable[..., Any]], ...] = (
 @contextmanager
 def patched(env: Any, branching: Any) -> Iterator[None]:
     """Put these in place; and `branching` in place of each generator that is made without a seed."""
-    found: list[tuple[Any, str, Any]] = [
-        (kind, *patch) for known, *patch in _PATCHES for kind in _loaded((known,)) if isinstance(env, kind)
-    ]
     generator, pair = np.random.default_rng, seeding.np_random
-    found.append((np.random, "default_rng", lambda seed=None: branching if seed is None else generator(seed)))
-    found.append((seeding, "np_random", lambda seed=None: (branching, 0) if seed is None else pair(seed)))
-    originals = [(kind, name, getattr(kind, name)) for kind, name, _ in found]
-    for kind, name, method in found:
-        setattr(kind, name, method)
+    with replaced(
+        *(
+            (kind, *patch)
+            for known, *patch in _PATCHES
+            for kind in _loaded((known,))
+            if isinstance(env, kind)
+        ),
+        (np.random, "default_rng", lambda seed=None: branching if seed is None else generator(seed)),
+        (seeding, "np_random", lambda seed=None: (branching, 0) if seed is None else pair(seed)),
+    ):
+        yield
+
+
+@contextmanager
+def replaced(*methods: Any) -> Iterator[None]:
+    """In this block, what holds a name holds another thing by it: (holder, name, thing)."""
+    originals = [(holder, name, getattr(holder, name)) for holder, name, _ in methods]
+    for holder, name, method in methods:
+        setattr(holder, name, method)
     try:
         yield
     finally:
-        for kind, name, method in originals:
-            setattr(kind, name, method)
+        for holder, name, method in originals:
+            setattr(holder, name, method)
+
+
+_CLOCKS = ("time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns")
+_OURS = str(Path(__file__).parents[2])
+
+
+@contextmanager
+def clock_watched() -> Iterator[set[str]]:
+    """The places, as file and line, of others' code that call `time.time` and its like in this block.
+
+    A function that somebody imported by its own name, and `datetime`, are not seen.
+    """
+    found, thread = set[str](), threading.get_ident()
+
+    def called(read: Callable[[], Any]) -> Any:
+        frame: FrameType | None = sys._getframe(1)
+        assert frame is not None
+        file, place = frame.f_code.co_filename, f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
+        while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+            frame = frame.f_back
+        if threading.get_ident() == thread and not file.startswith(_OURS) and frame is None:
+            found.add(place)  # as nothing is being imported
+        return read()
+
+    with replaced(*((time, name, partial(called, getattr(time, name))) for name in _CLOCKS)):
+        yield found
+
+
+class _Sums(dict[str, Any]):
+    def __missing__(self, key: str) -> None:
+        raise InputError(
+            "env: a wrapper reads info['episode'] of a recording below it, which is left out; let it sum up "
+            "what it needs itself"
+        )
+
+
+class Recorded(gym.Wrapper[Any, Any, Any, Any]):
+    """Stands for a recording (Monitor, RecordEpisodeStatistics) below a wrapper with a step of its own."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if terminated or truncated:
+            info["episode"] = _Sums()
+        return observation, reward, terminated, truncated, info

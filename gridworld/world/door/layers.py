@@ -18,7 +18,6 @@ import random
 import types
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from operator import itemgetter
 from typing import Any
 
 import gymnasium as gym
@@ -38,10 +37,9 @@ from gridworld.world.door.attributes import (
     spaces_in,
     state_of,
 )
-from gridworld.world.door.copies import ATOMS, Copier, Reader, Recorder, SharedCopier
-from gridworld.world.door.stand_ins import Limited, Recorded, Timed
+from gridworld.world.door.copies import ATOMS, Anew, Copier, Reader, Recorder, SharedCopier
+from gridworld.world.door.counters import NUMBERS, Counter, Key, Unread
 from gridworld.world.door.uniform import Uniform
-from gridworld.world.door.unread import NUMBERS, Counter, Unread
 
 Env = gym.Env[Any, Any]
 _CODE = (type, types.ModuleType, types.FunctionType, types.BuiltinFunctionType, np.ufunc)
@@ -58,10 +56,6 @@ class Changed(Exception):  # noqa: N818
         self.found = found
 
 
-class SharedChanged(Exception):  # noqa: N818
-    """An object that its modules or classes hold has changed, so that it is state, which is copied."""
-
-
 class Layers:
     """The layers of an environment, the outermost first, and copies of what they hold.
 
@@ -69,7 +63,6 @@ class Layers:
         where: what messages call the environment.
         env: it is changed, and left as it was by `restored`.
         branching: the generator in place of every other.
-        counts_time: whether the count of a `TimeLimit` is state too, since something reads it.
         keeps_shared: whether objects that its modules and classes hold are kept as they are.
         keeps_views: whether an array that shows another's memory does so in copies, too.
     """
@@ -79,32 +72,18 @@ class Layers:
         where: str,
         env: Env,
         branching: Any,
-        counts_time: bool = False,
         keeps_shared: bool = True,
         keeps_views: bool = False,
     ) -> None:
         self._where, self.branching, self.keeps_views = where, branching, keeps_views
-        self.limit: int | None = None
         self.layers: list[Any] = []
-        self.limited: Limited | None = None  # in place of a time limit below a wrapper
-        chain: list[Any] = []
+        self._chain = chain = list[Any]()  # without the neutral ones
         for layer in layers_of(env):
-            if known.is_limit(layer) and not counts_time:
-                most = int(vars(layer)["_max_episode_steps"])
-                if most > 0:  # -1 is "none" to `gymnasium.make`
-                    self.limit = most if self.limit is None else min(self.limit, most)
-                if self.limited is not None:
-                    raise Timed  # one of two below a wrapper may be a count of other steps
-                if self.layers:
-                    self.limited = Limited(layer.env)
-                    chain.append(self.limited)
-            elif not known.is_neutral(layer):
+            if not known.is_neutral(layer):
                 self.layers.append(layer)
                 chain.append(layer)
             elif known.records(layer) and not all(map(known.steps_once, self.layers)):
-                chain.append(Recorded(layer.env))
-        self._chain = chain  # without the neutral ones
-        self.may_see_cuts = self.limited is not None and not all(map(known.steps_once, self.layers[:-1]))
+                chain.append(known.Recorded(layer.env))
         self.env: Any = self.layers[0]
         self.reset_options = {} if self.env is env else {"options": None}  # as a layer around it has it
         self.base: Any = self.layers[-1]
@@ -115,10 +94,12 @@ class Layers:
         self.fixed: dict[Any, Any] = {id(each): each for each in (*chain, branching)} | self.shared
         self._known = self.fixed  # and what is within attributes that are left in place
         self._shares = False  # whether lists and dictionaries are among these
-        self._left: list[list[tuple[str, Any]]] = [[] for _ in self.layers]  # in place, by layers
+        self._left: list[dict[str, Any]] = [{} for _ in self.layers]  # in place, by layers
+        self._names: dict[tuple[str, ...], int] = {}  # of attributes that are copied: their numbers in copies
         self._digest_left = b""
         self.read: set[tuple[int, str]] = set()  # attributes that something has read
         self.counters: dict[tuple[int, str], Counter] = {}  # numbers that change, and that nothing has read
+        self._counted: list[list[tuple[str, Counter]]] = [[] for _ in self.layers]  # the same by layers
         self._compares_forms = False  # whether what a stand-in was made from counts in a copy
         # Those that cannot be replaced, with their states.
         self._generators = [(each, state_of(each)) for _, each in generators_of(holders)]
@@ -218,30 +199,28 @@ class Layers:
         A stand-in takes the place of each number that changes and that nothing has read so far; `series`
         has the numbers in some episodes, after the reset and each step.
         """
-        self._left, self._known, self._shares = [[] for _ in self.layers], self.fixed, False
-        self.counters = {}
+        self._left, self._known, self._shares = [{} for _ in self.layers], self.fixed, False
+        self.counters, self._counted = {}, [[] for _ in self.layers]
         for key in changing - self.read:
             values = [[now[key] for now in each if key in now] for each in series]
             self.counters[key] = counter = Counter(key, values)
+            self._counted[key[0]].append((key[1], counter))
+            *outer, layer = self.layers[: key[0] + 1]
+            counter.is_limit = known.is_limit(layer) and key[1] == "_elapsed_steps"
+            counter.only_cuts = counter.is_limit and all(map(known.steps_once, outer))
             self._keep(counter.blank)
-        held = [
-            (number, name, value)
-            for number, layer in enumerate(self.layers)
-            for name, value in attributes(layer).items()
-            if (number, name) not in changing
-        ]
         most = _LARGE if len(self.take()) > _SMALL else math.inf
         self._left = [
-            [
-                (name, value)
-                for at, name, value in held
-                if at == number and (self._is_one(value) or len(self._dump(value)) > most)
-            ]
-            for number in range(len(self.layers))
+            {
+                name: value
+                for name, value in attributes(layer).items()
+                if (number, name) not in changing and (self._is_one(value) or len(self._dump(value)) > most)
+            }
+            for number, layer in enumerate(self.layers)
         ]
         self._digest_left = self._content_left()
         recorder = Recorder(self)
-        for _, value in itertools.chain.from_iterable(self._left):
+        for value in itertools.chain.from_iterable(left.values() for left in self._left):
             recorder.dump(value)
         # One object stays one, wherever it is held.
         self._known = self.fixed | {id(each): each for each in recorder.met}
@@ -252,13 +231,13 @@ class Layers:
         return type(value) in ATOMS or id(value) in self.fixed
 
     def _content_left(self) -> bytes:
-        return self._dump([[value for _, value in left] for left in self._left], self.fixed)
+        return self._dump(self._left, self.fixed)
 
     def changed_left(self) -> list[tuple[int, str]]:
         """All that was left in place, if some of it has changed after all."""
         if self._content_left() == self._digest_left:
             return []
-        return [(number, name) for number, left in enumerate(self._left) for name, _ in left]
+        return [(number, name) for number, left in enumerate(self._left) for name in left]
 
     def check_left(self) -> None:
         """Raise `Changed` if what was left in place has changed."""
@@ -267,31 +246,39 @@ class Layers:
 
     def take(self, without: Sequence[str] = ()) -> bytes:
         """A copy of the state. Equal copies are of equal states; equal states may have several."""
-        return self._dump(self._held(without))
+        parts = []
+        for held in self._held(without):
+            names = tuple(held)
+            if names not in self._names:
+                self._names[names] = len(self._names)
+            parts.append([self._names[names], *held.values()])
+        return self._dump(parts)
 
-    def _held(self, without: Sequence[str] = ()) -> list[list[tuple[str, Any]]]:
+    def _held(self, without: Sequence[str] = ()) -> list[dict[str, Any]]:
         held = []
-        for number, (layer, left) in enumerate(zip(self.layers, self._left, strict=True)):
+        for layer, left, counters in zip(self.layers, self._left, self._counted, strict=True):
             found = attributes(layer)
-            for name, value in left:
+            for name, value in left.items():
                 now = found.pop(name, Changed)
                 if now is not value and not (type(now) is type(value) in ATOMS and now == value):
-                    raise Changed([(number, name)])
-            for name in found:
-                counter = self.counters.get((number, name))
-                if counter is not None and (type(found[name]) in NUMBERS or type(found[name]) is Unread):
+                    raise Changed([(self.layers.index(layer), name)])
+            for name, counter in counters:
+                if name in found and (type(found[name]) in NUMBERS or type(found[name]) is Unread):
                     found[name] = counter.blank
-            held.append(sorted((item for item in found.items() if item[0] not in without), key=itemgetter(0)))
+            held.append({name: found[name] for name in sorted(found) if name not in without})
         return held
 
     def put(self, copy: bytes, is_step_next: bool = True) -> None:
         """Make a copy the state of all layers; numbers that are counted may be compared in a step alone."""
-        held = [dict(items + left) for items, left in zip(self._load(copy), self._left, strict=True)]
-        for (number, name), counter in self.counters.items():
-            if is_step_next and type(held[number].get(name)) is Unread:
-                held[number][name] = counter.fresh()
-        for layer, content in zip(self.layers, held, strict=True):
-            set_attributes(layer, content)
+        names = list(self._names)
+        for layer, left, counters, (number, *values) in zip(
+            self.layers, self._left, self._counted, self._load(copy), strict=True
+        ):
+            held = dict(zip(names[number], values, strict=True)) | left
+            for name, counter in counters if is_step_next else ():
+                if type(held.get(name)) is Unread:
+                    held[name] = counter.fresh()
+            set_attributes(layer, held)
 
     def check_counters(self, is_reset: bool) -> None:
         """Note how numbers that are counted have changed in a reset or a step."""
@@ -307,10 +294,14 @@ class Layers:
             if type(value) in NUMBERS
         }
 
+    def uncertain(self) -> set[Key]:
+        """The counters of which it is not known that they do no more than cut episodes."""
+        return {key for key, counter in self.counters.items() if not counter.only_cuts}
+
     def check_shared(self) -> None:
-        """Raise `SharedChanged` if an object that is kept for its modules and classes has changed."""
+        """Begin anew if an object that is kept for its modules and classes has changed: then it is state."""
         if self._changed_shared():
-            raise SharedChanged
+            raise Anew(keeps_shared=False)
 
     def _shared_content(self, keys: Iterable[int]) -> dict[int, bytes]:
         """What these of the shared objects hold, by their ids; without those that cannot be copied."""
@@ -346,11 +337,11 @@ class Layers:
     def values(self, ignore: Sequence[str] = ()) -> dict[tuple[int, str], bytes]:
         """A copy of each attribute that is not left in place, by the number of its layer and its name."""
         found = {}
-        for number, items in enumerate(self._held(ignore)):
-            for name, value in items:
+        for number, held in enumerate(self._held(ignore)):
+            for name, value in held.items():
                 try:
                     found[number, name] = self._dump(value)
-                except (InputError, Timed):
+                except InputError:
                     raise
                 except Exception as error:  # whatever the classes in it raise
                     raise self._uncopied([{name: value}], error) from error

@@ -22,20 +22,16 @@ import numpy as np
 from gymnasium import spaces
 
 from gridworld.base.errors import GYMNASIUM, InputError, in_short, on_a_line
-from gridworld.world.door import known, limits
+from gridworld.world.door import known
 from gridworld.world.door.beliefs import Step, lumped
 from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES, SAMPLED, Budget
-from gridworld.world.door.clock import watched
-from gridworld.world.door.copies import ViewsShared
-from gridworld.world.door.episodes import check_by_episodes, check_by_word
-from gridworld.world.door.layers import Changed, Env, Layers, SharedChanged
-from gridworld.world.door.observations import Seen
+from gridworld.world.door.checks import Resets, check_by_episodes, check_by_word, walk
+from gridworld.world.door.copies import Anew
+from gridworld.world.door.counters import Read, check_cuts, counted
+from gridworld.world.door.layers import Changed, Env, Layers
 from gridworld.world.door.rejection import Rejecting
-from gridworld.world.door.resets import Resets
-from gridworld.world.door.stand_ins import Timed
-from gridworld.world.door.unread import Read
-from gridworld.world.door.walks import walk
 from gridworld.world.outcomes import MOST_ACTIONS
+from gridworld.world.shown import Seen
 
 OVER = -1  # in place of the state in which an episode ends
 _BEYOND = 1_000  # states further than a step limit that are found too, so that a small world is whole
@@ -50,10 +46,6 @@ _INTS = (
     "e.g. by int(action)"
 )
 Result = tuple[int, bytes, float, bool, bool]
-
-
-class _Missing(Exception):  # noqa: N818
-    """An attribute is missing that a wrapper which was left out may have."""
 
 
 @dataclass
@@ -121,25 +113,20 @@ class Search:
 
     def explore(self) -> None:
         """Find all states that can be reached, and what every action does there."""
-        how = {"counts_time": False, "keeps_shared": True, "keeps_views": False}
-        with watched() as self.clock_readers:
+        how: dict[str, bool] = {}
+        with known.clock_watched() as self.clock_readers:
             while not self.budget.is_explored:
                 try:
                     self._explored(**how)
                     self.budget.is_explored = True
-                except SharedChanged:
-                    how["keeps_shared"] = False
-                except ViewsShared:
-                    how["keeps_views"] = True
-                except (_Missing, Timed):  # something reads what is around it: a time limit's count, say
-                    how["counts_time"] = True
+                except Anew as error:
+                    how |= error.how
 
     def _explored(self, **how: bool) -> None:
         runs = (Search.reset_from.__code__, Search.stepped_from.__code__)
         self.branching = Rejecting(self.where, self._everything, runs, self._read is not None, self._compares)
         self.branching.until = time.monotonic() + self.budget.seconds_left()
         self.layers = layers = Layers(self.where, self.env, self.branching, **how)
-        self._is_complete = how["counts_time"]  # nothing that an environment may read is left out
         with layers.restored():
             self.begin, before = layers.take(), layers.values()
             changing: set[tuple[int, str]] = set()
@@ -163,9 +150,9 @@ class Search:
                 layers.put(self.begin)
                 layers.leave(changing, series)
                 try:
-                    if layers.counters:
+                    if layers.uncertain():
                         if walk(self, np.int64) != as_sent:
-                            raise Read(set(layers.counters))
+                            raise Read(layers.uncertain())
                         layers.put(self.begin)
                     self._explore()
                     layers.check_left()
@@ -228,7 +215,7 @@ class Search:
         size = checked = 0  # of the states in `waiting`, those from which a reset was tried
         for place, state in enumerate(waiting):  # which grows
             budget.show(f"{len(self.states):,} states, {place:,} of them tried")
-            limit = limits.met(self)
+            limit = counted(self)
             if beyond is None and state.depth >= (limit or _DEEPEST):
                 if limit is None:
                     still = f"after {_DEEPEST:,} steps it still finds new states"
@@ -249,6 +236,7 @@ class Search:
                 for late in waiting[beyond:]:
                     late.steps = ()
                 del self.states[size:]
+                self._by_copy = {key: each for key, each in self._by_copy.items() if each.number < size}
                 self._check_resets(waiting[checked:beyond])
                 break
         self.resets.check(next(each.copy for each in reversed(self.states) if each.copy))
@@ -277,15 +265,10 @@ class Search:
 
     def stepped_from(self, copy: bytes, depth: int, action: Any) -> Result:
         self.layers.put(copy)
-        limited = self.layers.limited
-        if limited is not None:
-            limited.steps = 0
         try:
             returned = self.layers.env.step(action)
         except Exception as error:  # whatever it raises
             raise self._failed(f"a step with action {action}", error) from error
-        if limited is not None and limited.steps != 1:
-            raise Timed
         if not (isinstance(returned, tuple) and len(returned) == 5):
             raise self.refusal(f"step() returns {on_a_line(returned)}, as in the old Gym: {GYMNASIUM}")
         observation, reward, terminated, truncated, _ = returned
@@ -305,10 +288,8 @@ class Search:
     def _failed(self, what: str, error: Exception) -> Exception:
         if isinstance(error, InputError):
             return error
-        if isinstance(error, AttributeError) and not self._is_complete:
-            return _Missing()
-        if self.layers.counters:  # which may be why
-            raise Read(set(self.layers.counters))
+        if counters := self.layers.uncertain():  # which may be why
+            raise Read(counters)
         return self.refusal(f"{what} fails: {in_short(error)}")
 
     def _tried(self, state: State) -> list[list[Step]]:
@@ -318,7 +299,7 @@ class Search:
             self.merged(functools.partial(self.stepped_from, state.copy, state.depth, np.int64(action)))
             for action in range(self.num_actions)
         ]
-        limits.check(self, state, steps)
+        check_cuts(self, state, steps)
         self.num_tried += 1
         if state.mask is not None:
             self.layers.put(state.copy)

@@ -1,10 +1,10 @@
 """The world of an environment, by trying every action in a copy of every state.
 
     layers        what its wrappers and itself hold, copied and put back
-    unread        numbers that are counted and that nothing reads are no state
     search        the states, and what each action does there
-    limits        step limits, which are no state
     rejection     the generator in place of its own, which takes every outcome of every draw
+    counters      numbers that are counted and that nothing reads, and step limits, are no state
+    checks        that resets and episodes lead to what was found
     beliefs       what observations leave open of the state; states that are alike are one
 
 The step limit is that of a `TimeLimit`, or the one at which the environment truncates by itself. A state at
@@ -22,14 +22,18 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from gridworld.base.user_input import check_memory
-from gridworld.world.door import limits
+from gridworld.world.door.attributes import GENERATORS, attributes
 from gridworld.world.door.beliefs import Beliefs, Node, Step
 from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES
+from gridworld.world.door.checks import walk
+from gridworld.world.door.counters import step_limit
 from gridworld.world.door.known import Named
-from gridworld.world.door.layers import Env
+from gridworld.world.door.layers import KEPT, Env, Layers
+from gridworld.world.door.rejection import Rejecting
 from gridworld.world.door.search import Search, State
 from gridworld.world.mdp import ENUMERATED, Mdp, taken
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
@@ -98,7 +102,7 @@ class _World:
             members.setdefault(number, []).append(state)
         self.members = [*(members[number] for number in range(len(members))), []]
         classes.append(len(members))  # what is over, as the last
-        limit, self._cuts_end = limits.of_world(search)
+        limit, self._cuts_end = step_limit(search)
         first = [
             [[self._in_classes(each, classes) for each in row] for row in found[0].steps]
             for found in self.members[:-1]
@@ -231,3 +235,35 @@ def _action_names(search: Search) -> list[str] | None:
     names = {member.value: member.name for member in actions}  # type: ignore[var-annotated]
     numbers = range(search.num_actions)
     return [names[number] for number in numbers] if names.keys() >= set(numbers) else None
+
+
+def traits(env: Env) -> Any:
+    """What two environments that are one task have in common: a walk, and what never changes."""
+    search = Search("env", env)
+    search.branching = branching = Rejecting("env", bytes, ())
+    search.layers = Layers("env", env, branching, keeps_views=True)
+    with search.layers.restored():
+        held = {
+            (number, name): value
+            for number, layer in enumerate(search.layers.layers)
+            for name, value in attributes(layer).items()
+        }
+        before = search.layers.values()
+        shown = walk(search, np.int64)
+        after = search.layers.values()
+    constant: dict[Any, Any] = {
+        key: held[key] if isinstance(held[key], gym.Space | EnvSpec) else value
+        for key, value in before.items()
+        if after.get(key) == value and held[key] is not branching
+    }
+    return [type(each) for each in search.layers.layers], constant, shown
+
+
+def contents(env: Env) -> dict[str, bytes]:
+    """The content of each attribute of an environment, to compare it with another's."""
+    layers = Layers("env", env.unwrapped, object(), keeps_views=True)
+    layers.is_adopting = True
+    skipped = {
+        name for name, value in attributes(layers.base).items() if isinstance(value, (*KEPT, *GENERATORS))
+    }
+    return {name: value for (_, name), value in layers.values([*skipped, "_np_random_seed"]).items()}

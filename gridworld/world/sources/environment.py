@@ -22,8 +22,7 @@ from gridworld.base.user_input import named_object
 from gridworld.world.door import known
 from gridworld.world.door.attributes import layers_of, random_states, state_of
 from gridworld.world.door.layers import Env
-from gridworld.world.door.traits import traits
-from gridworld.world.door.world import Found, enumerated
+from gridworld.world.door.world import Found, enumerated, traits
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources.gymnasium_table import compile_table, has_table
 

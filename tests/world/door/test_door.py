@@ -602,6 +602,21 @@ def test_plain_sb3_on_the_tutorials_world() -> None:
     assert total / 300 == pytest.approx(score.value, abs=0.1)
 
 
+class Counted(gym.RewardWrapper[Any, Any]):
+    """Pays the opposite from the fifth step of its life on, which no reset ends."""
+
+    count = 0
+
+    def reward(self, reward: Any) -> float:
+        self.count += 1
+        return float(reward) if self.count < 5 else -float(reward)
+
+
+def test_a_count_beyond_the_step_limit_that_no_reset_ends_is_named() -> None:
+    with pytest.raises(InputError, match=r"a reset does not always lead to the same state \(in count\)"):
+        gridworld.compile_env(Counted(wrappers.TimeLimit(Line(), 20)))
+
+
 class Tiger(gym.Env[int, int]):
     """A tiger behind one of two doors; who listens hears it behind the right one in 17 of 20 cases."""
 

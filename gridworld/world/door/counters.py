@@ -1,20 +1,26 @@
-"""What stands for a number that is counted or summed up and that nothing reads, or only to cut episodes.
+"""Numbers that are counted or summed up, and step limits: what nothing reads, or only to cut, is no state.
 
 A counter of all resets, say, or the sum of an episode's rewards that only `info` shows: as state it would
 multiply the others without end. So each number that changes is replaced by a stand-in before every run, which
 may be counted on and passed around. A number that grows by the same in every step, as a count of them, may be
-compared with others too: if the comparison does nothing but truncate, its moment is a step limit. Whatever
-else is done with a stand-in raises `Read`, and then the number is state.
+compared with others too: if the comparison does nothing but truncate, as in a `TimeLimit`, its moment is a
+step limit. Whatever else is done with a stand-in raises `Read`, and then the number is state.
 """
 
 from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from collections.abc import Callable, Iterator, Sequence
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
+
+from gridworld.world.door.beliefs import Step
+
+if TYPE_CHECKING:
+    from gridworld.world.door.search import Search, State
 
 NUMBERS = frozenset(
     {int, float, *(k for k in np.sctypeDict.values() if issubclass(k, np.integer | np.floating))}
@@ -60,6 +66,8 @@ class Counter:
         self.blank = Unread(self, None)  # what a copy holds: it says nothing of what it was made from
         self.start = self.step = 0  # after a reset, and what each step adds
         self.cuts = False  # whether comparisons come out as they do at the limit
+        self.is_limit = False  # whether it is that of a `TimeLimit`,
+        self.only_cuts = False  # and nothing around this can see more of it than that it cuts
         self.num_checked = 0  # of the states, those from which steps were tried at the limit, too
         self.limits: set[int] = set()  # the steps in which a comparison comes out otherwise than before
         self._outcomes: dict[Any, tuple[bool, int | None]] = {}
@@ -171,3 +179,71 @@ for _name in _COMPARISONS:
     setattr(Unread, f"__{_name}__", functools.partialmethod(Unread._compared, _name))
 for _name in _READING:
     setattr(Unread, f"__{_name}__", Unread._read)
+
+
+# ---- step limits ----
+
+
+def counted(search: Search) -> int | None:
+    """The step in which a counter cuts every episode, as far as one was met."""
+    counters = search.layers.counters.values()
+    return min((limit for each in counters for limit in each.limits), default=None)
+
+
+def check_cuts(search: Search, state: State, steps: list[list[Step]]) -> None:
+    """At each limit, the steps from a state must be cut, and otherwise do what they do before.
+
+    Raises:
+        Read: what compares a counter does something else, or only in some states.
+    """
+    for counter in search.layers.counters.values():
+        if counter.limits and not counter.only_cuts:
+            if counter.num_checked < search.num_tried or not _only_cuts(search, state, steps, counter):
+                raise Read({counter.key})
+            counter.num_checked += 1
+
+
+def _only_cuts(search: Search, state: State, steps: list[list[Step]], limit: Counter) -> bool:
+    limit.cuts = search.is_cutting = True
+    try:
+        for action, usual in enumerate(steps):
+            run = functools.partial(search.stepped_from, state.copy, state.depth, np.int64(action))
+            cut: dict[Any, Fraction] = {}
+            for (_, *shown), probability in search.branching.outcomes(run).items():
+                key = (*shown[:3], shown[2] or shown[3])
+                cut[key] = cut.get(key, Fraction(0)) + probability
+            whole: dict[Any, Fraction] = {}
+            for each in usual:
+                key = (each.seen, each.reward, each.terminated, True)
+                whole[key] = whole.get(key, Fraction(0)) + each.probability
+            if cut != whole:
+                return False
+    finally:
+        limit.cuts = search.is_cutting = False
+    return True
+
+
+def step_limit(search: Search) -> tuple[int | None, bool]:
+    """The step limit of what a search found, and whether something else truncates too, by the state."""
+    known = [each for each in (counted(search), search.limit_met) if each is not None]
+    cut = {state.depth + 1 for state, step in _steps(search) if step.truncated}
+    if cut:
+        on = {state.depth + 1 for state, step in _steps(search) if not step.truncated}
+        is_timed = all(
+            search.states[step.following].depth == state.depth + 1
+            for state, step in _steps(search)
+            if step.following >= 0
+        )
+        if not is_timed or max(on, default=0) >= min(cut):  # a state must have one time
+            return min(known, default=None), True
+        known.append(min(cut))
+    return min(known, default=None), False
+
+
+def _steps(search: Search) -> Iterator[tuple[State, Step]]:
+    """The steps that do not terminate an episode, with the states from which they are."""
+    for state in search.states:
+        for row in state.steps:
+            for step in row:
+                if not step.terminated:
+                    yield state, step
