@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any, overload
 
@@ -22,7 +23,16 @@ if TYPE_CHECKING:
 from gridworld.base.bounds import STEP_LIMIT, positive_int
 from gridworld.base.errors import InputError
 from gridworld.world.layout import CLASSIC, MOVES, NUM_COLS, NUM_ROWS, Cell, Layout, load
-from gridworld.world.mdp import BoolArray, IntArray, Mdp, checked_reward, finite, frozen, grid_places
+from gridworld.world.mdp import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Mdp,
+    checked_reward,
+    finite,
+    frozen,
+    grid_places,
+)
 
 ACTION_NAMES = ("up", "right", "down", "left")
 NUM_ACTIONS = len(MOVES)
@@ -48,6 +58,17 @@ class GridMdp(Mdp):
     def default_step_limit(self) -> int:
         """The step limit of a batch that is given none: the world's own, or a map's 100."""
         return self.max_episode_steps or STEP_LIMIT
+
+    @cached_property
+    def thresholds(self) -> FloatArray:
+        """(S, A, K - 1), of every move alike."""
+        given = np.array([1 - self.slip, 1 - self.slip / 2] if self.slip else [])
+        return np.broadcast_to(given, (*self.neighbour.shape, len(given)))
+
+    @cached_property
+    def absorbing(self) -> BoolArray:
+        """(S,), the ends and the walls."""
+        return frozen(self.terminal | self.wall)
 
     def text(self) -> str:
         """The map."""
@@ -131,7 +152,6 @@ def compile_mdp(
     # Outcome 0 is the move itself; with slip, 1 and 2 are the moves at right angles to it.
     outcomes = [neighbour] if slip == 0 else [neighbour, np.roll(neighbour, -1, 1), np.roll(neighbour, 1, 1)]
     chances = [1.0] if slip == 0 else [1 - slip, slip / 2, slip / 2]
-    thresholds = [] if slip == 0 else [1 - slip, 1 - slip / 2]
     next_state = np.stack(outcomes, axis=-1)
     entered = step_reward + goal_reward * goal + trap_reward * (trap | cliff)
     for end in layout.ends:
@@ -152,11 +172,9 @@ def compile_mdp(
         neighbour=frozen(neighbour),
         next_state=frozen(next_state),
         probability=np.broadcast_to(np.array(chances), next_state.shape),
-        thresholds=np.broadcast_to(np.array(thresholds), (*neighbour.shape, len(thresholds))),
         reward=frozen(reward),
         terminal=frozen(goal | trap),
         goal=frozen(goal),
-        absorbing=frozen(absorbing),
         wall=frozen(wall),
         cliff=frozen(cliff),
         start=frozen(start),

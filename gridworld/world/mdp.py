@@ -50,8 +50,6 @@ class Mdp:
     terminal: BoolArray  # (S,), where an episode is over
     goal: BoolArray  # (S,), the terminal states that are a success
     start: FloatArray  # (S,), a distribution
-    thresholds: FloatArray  # (S, A, K - 1): the outcome of a uniform draw is how many of them it reaches
-    absorbing: BoolArray  # (S,), terminal, or a state that no action leaves and nothing is paid in
     number: IntArray  # (S,), int64, what the environment calls each state, its observation
     places: IntArray | None = None  # (S, 3), int64: panel, row and column in pictures, -1 where it has none
     panel_names: tuple[str, ...] = ()  # what pictures call each panel, if anything
@@ -124,6 +122,22 @@ class Mdp:
         else:
             index = np.searchsorted(self._start_thresholds, draws, side="right")
         return self.start_states[index]
+
+    @cached_property
+    def thresholds(self) -> FloatArray:
+        """(S, A, K - 1): the outcome of a uniform draw is how many of them it reaches.
+
+        Running sums; no draw reaches those behind the last possible outcome.
+        """
+        sums: FloatArray = np.cumsum(self.probability, axis=2)[:, :, :-1]
+        behind = np.cumsum(self.probability[:, :, ::-1], axis=2)[:, :, ::-1][:, :, 1:]
+        sums[behind == 0] = np.inf
+        return frozen(sums)
+
+    @cached_property
+    def absorbing(self) -> BoolArray:
+        """(S,), terminal, or a state that no action leaves and nothing is paid in."""
+        return frozen(self.terminal | resting_states(self.next_state, self.probability, self.reward))
 
     @cached_property
     def trap(self) -> BoolArray:
@@ -233,6 +247,12 @@ def steps_from(starts: IntArray, next_state: IntArray, taken: BoolArray) -> IntA
                 steps[state] = steps[origin] + 1
                 waiting.append(state)
     return np.array(steps)
+
+
+def resting_states(next_state: IntArray, probability: FloatArray, reward: FloatArray) -> BoolArray:
+    """(S,), the states that no action leaves and nothing is paid in."""
+    stays = (next_state == np.arange(len(next_state))[:, None, None]) & (reward == 0)
+    return np.asarray((stays | (probability == 0)).all(axis=(1, 2)))
 
 
 def grid_places(num_rows: int, num_cols: int) -> NDArray[np.int64]:

@@ -28,6 +28,7 @@ from gridworld.world.mdp import (
     checked_reward,
     frozen,
     leaves_of,
+    resting_states,
     steps_from,
     taken,
 )
@@ -35,7 +36,7 @@ from gridworld.world.shown import misfit
 
 MOST_ACTIONS = 256
 MOST_STATES = 512 * 512
-_ROUNDING = 1e-9  # how far a sum of probabilities may be from 1, and a threshold from its sum
+_ROUNDING = 1e-9  # how far a sum of probabilities may be from 1
 _BYTES = 64  # of an outcome in all tables, and while they are made
 _MOST_BYTES = 4 * 2**30
 _LONGEST_TEXT = 200
@@ -108,8 +109,6 @@ def mdp_from_outcomes(
         terminal=frozen(terminal),
         goal=frozen(goal),
         start=frozen(np.concatenate([outcomes.start, np.zeros(further)])),
-        thresholds=frozen(thresholds_of(probability)),
-        absorbing=frozen(absorbing_states(next_state, probability, reward, terminal)),
         number=frozen(number),
         places=None if places is None else frozen(places[number].astype(np.int64)),
         panel_names=tuple(panel_names),
@@ -160,22 +159,6 @@ def _ends(outcomes: Outcomes) -> tuple[IntArray, BoolArray, IntArray, IntArray]:
     key = every[ending]
     leads_to[ending] = states[np.searchsorted(keys, np.where(np.isin(key, keys), key, key ^ 1))]
     return states, keys % 2 == 1, np.concatenate([np.arange(size), number[taken]]), leads_to
-
-
-def thresholds_of(probability: FloatArray) -> FloatArray:
-    """`Mdp.thresholds`: running sums; no draw reaches those behind the last possible outcome."""
-    sums: FloatArray = np.cumsum(probability, axis=2)[:, :, :-1]
-    behind = np.cumsum(probability[:, :, ::-1], axis=2)[:, :, ::-1][:, :, 1:]
-    sums[behind == 0] = np.inf
-    return sums
-
-
-def absorbing_states(
-    next_state: IntArray, probability: FloatArray, reward: FloatArray, terminal: BoolArray
-) -> BoolArray:
-    """`Mdp.absorbing`."""
-    stays = (next_state == np.arange(len(next_state))[:, None, None]) & (reward == 0)
-    return np.asarray(terminal | (stays | (probability == 0)).all(axis=(1, 2)))
 
 
 def check_size(name: str, states: int, actions: int, outcomes: int) -> None:
@@ -321,15 +304,14 @@ def verified(mdp: Mdp, where: str) -> Mdp:
 
 def _check_shapes(mdp: Mdp, where: str) -> None:
     shape = np.shape(mdp.next_state)
-    size, actions, outcomes = shape if len(shape) == 3 else (0, 0, 0)
+    size, _, outcomes = shape if len(shape) == 3 else (0, 0, 0)
     expected: dict[str, tuple[Any, tuple[int, ...]]] = {
         "next_state": (np.int32, (size, len(mdp.action_names), outcomes)),
         "probability": (np.float64, shape),
         "reward": (np.float64, shape),
-        "thresholds": (np.float64, (size, actions, max(outcomes - 1, 0))),
         "start": (np.float64, (size,)),
         "number": (np.int64, (size,)),
-        **dict.fromkeys(("terminal", "goal", "absorbing"), (np.bool_, (size,))),
+        **dict.fromkeys(("terminal", "goal"), (np.bool_, (size,))),
         **({} if mdp.places is None else {"places": (np.int64, (size, 3))}),
     }
     for name, (dtype, wanted) in expected.items():
@@ -341,22 +323,12 @@ def _check_shapes(mdp: Mdp, where: str) -> None:
 
 
 def _check_states(mdp: Mdp, where: str) -> None:
-    own = np.arange(mdp.num_states)[:, None, None]
-    possible = mdp.probability > 0
-    stays = (~possible | (mdp.next_state == own)).all(axis=(1, 2))
-    unpaid = (~possible | (mdp.reward == 0)).all(axis=(1, 2))
-    sums = thresholds_of(mdp.probability)
-    last = np.isinf(sums)  # behind the last possible outcome
-    near = np.abs(np.where(last, 0.0, mdp.thresholds - np.where(last, 0.0, sums))) <= _ROUNDING
-    fine = np.where(last, mdp.thresholds >= 1 - _ROUNDING, near)
-    fine[:, :, 1:] &= mdp.thresholds[:, :, 1:] >= mdp.thresholds[:, :, :-1]
+    rests = resting_states(mdp.next_state, mdp.probability, mdp.reward)
     number = mdp.number
     for wrong, mistake in (
-        (mdp.terminal & ~mdp.absorbing, "is terminal but not absorbing"),
-        (mdp.absorbing & ~(stays & unpaid), "is absorbing, but has a successor or a reward"),
+        (mdp.terminal & ~rests, "is terminal, but has a successor or a reward"),
         (mdp.goal & ~mdp.terminal, "is a goal but not terminal"),
         (mdp.terminal & (mdp.start > 0), "is terminal and also a start"),
-        (~fine.all(axis=(1, 2)), "has thresholds that are not the sums of its probabilities"),
         ((number < 0) | (number >= len(number)), f"has a number that is not from 0 to {len(number) - 1}"),
         (() if mdp.places is None else (mdp.places < -1).any(axis=1), "has a place below -1"),
     ):

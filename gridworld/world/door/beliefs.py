@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gridworld.base.errors import InputError
+from gridworld.world.mdp import IntArray
 from gridworld.world.outcomes import Outcomes, check_size
 
 Belief = tuple[tuple[int, Fraction], ...]  # hidden states, ascending, with their probabilities
@@ -177,22 +178,24 @@ class Beliefs:
                 )
         return total, self._numbers[key]
 
-    def outcomes(self, name: str, num_actions: int) -> Outcomes:
-        """Its tables; a node in which nothing was tried stays as it is."""
-        size = len(self.nodes)
+    def outcomes(self, name: str, num_actions: int, numbers: IntArray, size: int) -> Outcomes:
+        """Its tables of `size` states, by the number (n,) of each node; what was not tried stays as it is."""
         width = max((len(row) for node in self.nodes for row in node.rows), default=1)
         check_size(name, size, num_actions, width)
         table = np.zeros((4, size, num_actions, width))
         table[0] = np.arange(size)[:, None, None]
         table[1, :, :, 0] = 1.0
-        for number, node in enumerate(self.nodes):
+        for number, node in zip(numbers, self.nodes, strict=True):
             for action, row in enumerate(node.rows):
                 table[:, number, action, : len(row)] = np.array(
-                    [(each.following, float(each.probability), each.reward, each.terminated) for each in row]
+                    [
+                        (numbers[each.following], float(each.probability), each.reward, each.terminated)
+                        for each in row
+                    ]
                 ).T
         start = np.zeros(size)
         for probability, number in self.starts:
-            start[number] = float(probability)
+            start[numbers[number]] += float(probability)
         ends, reward = table[3] > 0, table[2]
         paid = ends & (reward > 0)
         return Outcomes(

@@ -36,7 +36,7 @@ from gridworld.world.door.layers import KEPT, Env, Layers
 from gridworld.world.door.rejection import Rejecting
 from gridworld.world.door.search import Search, State
 from gridworld.world.mdp import ENUMERATED, Mdp, taken
-from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
+from gridworld.world.outcomes import mdp_from_outcomes
 from gridworld.world.shown import of_learners, stacked
 
 
@@ -138,7 +138,7 @@ class _World:
         own = of_learners(space, rows)
         mdp = mdp_from_outcomes(
             name,
-            _renumbered(beliefs.outcomes(name, search.num_actions), numbers, size),
+            beliefs.outcomes(name, search.num_actions, numbers, size),
             action_names=_action_names(search),
             places=places,
             panel_names=panels,
@@ -202,29 +202,6 @@ class _World:
         found += "; what it truncates, other than by a step limit, is an end" if self._cuts_end else ""
         readers = sorted(self.search.clock_readers)
         return f"{found}; the clock is read ({', '.join(readers[:3])})" if readers else found
-
-
-def _renumbered(outcomes: Outcomes, numbers: NDArray[Any], size: int) -> Outcomes:
-    """The same with other numbers; of nodes with one number, an end and another, the other's row counts."""
-    actions, count = outcomes.next_state.shape[1:]
-    tables: dict[str, Any] = {
-        "next_state": np.tile(np.arange(size)[:, None, None], (1, actions, count)),
-        "probability": np.tile(np.eye(count)[0], (size, actions, 1)),
-        "reward": np.zeros((size, actions, count)),
-        "terminated": np.zeros((size, actions, count), dtype=np.bool_),
-    }
-    is_end = (outcomes.next_state == np.arange(len(numbers))[:, None, None]).all(axis=(1, 2))
-    order = np.argsort(~is_end, kind="stable")  # ends first, so that others overwrite them
-    for key, table in tables.items():
-        given = getattr(outcomes, key)
-        table[numbers[order]] = numbers[given[order]] if key == "next_state" else given[order]
-    start = np.zeros(size)
-    np.add.at(start, numbers, outcomes.start)
-    success = None
-    if outcomes.success is not None:
-        success = np.zeros((size, actions, count), dtype=np.bool_)
-        success[numbers[order]] = outcomes.success[order]
-    return Outcomes(**tables, start=start, success=success)
 
 
 def _action_names(search: Search) -> list[str] | None:

@@ -289,6 +289,8 @@ def _from_fields(found: dict[str, NDArray[Any]], where: str) -> Mdp:
     fields = {field.name: field for field in dataclasses.fields(Mdp)}
     if not np.array_equal(found.pop("format", np.array("")), _FORMAT):
         raise InputError(f"{where}: not a world of this version, must contain format={_FORMAT}")
+    for key in ("thresholds", "absorbing"):  # of older files; they follow from the others
+        found.pop(key, None)
     own = _own(found, where)
     needed = {name for name, field in fields.items() if field.default is dataclasses.MISSING}
     if not needed <= found.keys() <= fields.keys():

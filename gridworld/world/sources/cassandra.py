@@ -247,7 +247,7 @@ def _of_beliefs(where: str, model: _Text, actions: list[str]) -> Mdp:
     observed = [int(node.seen or len(model.names["observation"])) for node in beliefs.nodes]
     mdp = mdp_from_outcomes(
         where,
-        beliefs.outcomes(where, len(actions)),
+        beliefs.outcomes(where, len(actions), np.arange(len(observed)), len(observed)),
         action_names=actions,
         own_observation=np.array(observed),
     )

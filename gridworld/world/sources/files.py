@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError, in_short
 from gridworld.base.user_input import COPIES, check_memory
-from gridworld.world.mdp import FloatArray
-from gridworld.world.outcomes import Outcomes, absorbing_states, check_size
+from gridworld.world.mdp import FloatArray, resting_states
+from gridworld.world.outcomes import Outcomes, check_size
 
 ROUNDING = 1e-5  # how far a sum of probabilities in a file may be from 1, as in pomdp-solve
 _MOST_UNPACKED = 2**30
@@ -67,7 +67,7 @@ def outcomes_of_matrices(
     following = np.argsort(chance == 0, axis=2, kind="stable")[:, :, :most]
     probability = np.take_along_axis(chance, following, 2)
     pays = np.where(probability > 0, np.take_along_axis(np.swapaxes(paid, 0, 1), following, 2), 0.0)
-    over = absorbing_states(following, probability, pays, np.zeros(size, dtype=np.bool_))
+    over = resting_states(following, probability, pays)
     if start is None:
         begins = np.ones(size) if over.all() else (~over).astype(np.float64)
         start = begins / begins.sum()
