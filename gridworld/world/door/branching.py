@@ -13,7 +13,7 @@ import itertools
 import math
 import sys
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -69,11 +69,8 @@ class Branching:
 
     def outcomes(self, step: Callable[[], Result]) -> dict[Result, Fraction]:
         """Run a step once for each sequence of draws: its different results, each with its probability."""
-        self._decisions, self._taken = [], []
         shares: dict[Result, dict[int, int]] = {}  # numerators by denominators, which is fast
-        for number in range(MOST_BRANCHES):
-            self.check_time(number)
-            result = self._ran(step)
+        for result in self._every_run(lambda: self._ran(step)):
             numerator, denominator = self._share()
             of_result = shares.setdefault(result, {})
             of_result[denominator] = of_result.get(denominator, 0) + numerator
@@ -83,14 +80,22 @@ class Branching:
                 for _ in range(1 + self._num_results % 3):
                     if self._ran(step) != result:
                         raise self._not_repeatable()
+        return {
+            result: sum((Fraction(part, of) for of, part in each.items()), Fraction(0))
+            for result, each in shares.items()
+        }
+
+    def _every_run(self, run: Callable[[], Any]) -> Iterator[Any]:
+        """What a run gives with each sequence of decisions, depth first."""
+        self._decisions, self._taken = [], []
+        for number in range(MOST_BRANCHES):
+            self.check_time(number)
+            yield run()
             while self._taken and self._taken[-1] + 1 == len(self._decisions[-1].possible):
                 self._taken.pop()
                 self._decisions.pop()
             if not self._taken:
-                return {
-                    result: sum((Fraction(part, of) for of, part in each.items()), Fraction(0))
-                    for result, each in shares.items()
-                }
+                return
             self._taken[-1] += 1
         raise InputError(f"{self._where}: one step has more than {MOST_BRANCHES:,} random outcomes")
 

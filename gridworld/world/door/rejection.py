@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from gridworld.base.errors import InputError
-from gridworld.world.door.branching import MOST_BRANCHES, OURS, Branching, Result
+from gridworld.world.door.branching import OURS, Branching, Result, Share
 
 OURS |= {__file__, functools.__file__}
 SAMPLES = 20_000  # real draws that each kind of rejection is compared with
@@ -34,11 +34,6 @@ _AGAIN = 200  # of another state whose step rejects at the same places
 FALSE_ALARM = 1e-9
 _SEED = 20_260_101
 _DRAWS = ("random", "uniform", "integers", "choice", "permutation", "shuffle", "binomial", "multinomial")
-Leaf = tuple[
-    list[tuple[tuple[int, ...], int]], Any
-]  # the decisions of a run (weights, taken), and its result
-
-
 Way = tuple[int, tuple[int, ...]]  # to a draw: how many decisions were taken before, and which
 
 
@@ -50,16 +45,20 @@ class _Place:
     way: Way
 
 
+@dataclass(frozen=True)
+class _Leaf:
+    """A run: which outcomes it took, their share before each and in the end, and what comes of it."""
+
+    taken: tuple[int, ...]
+    shares: list[Share]
+    results: dict[Any, Fraction]
+
+
 class _Again(BaseException):  # which an environment's `except Exception` does not catch
     """A draw at which everything is as at one that was met before: what follows it is known."""
 
     def __init__(self, place: Any, way: Way) -> None:
         self.place = _Place(place, way)
-
-
-class _Known(BaseException):
-    def __init__(self, place: Any) -> None:
-        self.place = place
 
 
 class Rejecting(Branching):
@@ -128,30 +127,26 @@ class Rejecting(Branching):
 
     def first(self, step: Callable[[], Result]) -> Result:
         """The result of a step in which every draw has its first outcome that is not rejected."""
-        self._decisions, self._taken, self._met, self._across = [], [], {}, False
+        self._met, self._across = {}, False
         known, self._known = self._known, {}  # since it is to run to its end
         try:
-            while True:
-                try:
-                    return self._ran(step)
-                except _Again:
-                    del self._decisions[self._place :], self._taken[self._place :]
-                    if not self._next():
-                        raise self._endless() from None
+            for result in self._every_run(lambda: self._run_or_place(step)):
+                if not isinstance(result, _Place):
+                    return result  # type: ignore[no-any-return]
+            raise self._endless()
         finally:
             self._known = known
 
     def _endless(self) -> InputError:
         return InputError(f"{self._where}: a loop draws again without end, since nothing ever fits")
 
-    def _next(self) -> bool:
-        """Go on to the next outcome of the last draw that has one; whether there is any."""
-        while self._taken and self._taken[-1] + 1 == len(self._decisions[-1].possible):
-            self._taken.pop()
-            self._decisions.pop()
-        if self._taken:
-            self._taken[-1] += 1
-        return bool(self._taken)
+    def _run_or_place(self, step: Callable[[], Any]) -> Any:
+        """The result of a step, or the place of a draw at which it is known what follows."""
+        try:
+            return self._ran(step)
+        except _Again as error:
+            del self._decisions[self._place :], self._taken[self._place :]
+            return error.place
 
     def _ran(self, step: Callable[[], Result]) -> Result:
         self._depth, self._seen, self._head = 0, set(), None
@@ -162,9 +157,9 @@ class Rejecting(Branching):
         if self.sampling is not None:
             return getattr(self.sampling, name)(*arguments, **options)
         if not self._depth and not self._takes_all and (place := self._place_of(name)) is not None:
-            if place in self._known:
-                raise _Known(place)
             way = self._place, tuple(self._taken[: self._place])
+            if place in self._known:
+                raise _Again(place, way)
             if self._head is None and place[0] in self._seen:
                 self._head = place[0]
             self._seen.add(place[0])
@@ -204,46 +199,37 @@ class Rejecting(Branching):
 
         From each draw that comes again on, the shares are a linear system: of results, and of such draws.
         """
-        self._decisions, self._taken, self._met = [], [], {}
-        leaves: list[Leaf] = []
-        again = set[_Place]()
-        for number in range(MOST_BRANCHES):
-            self.check_time(number)
-            result: dict[Any, Fraction]
-            try:
-                result = {(self._ran(step),): Fraction(1)}
-            except _Again as error:
-                result = {error.place: Fraction(1)}
-                again.add(error.place)
-                del self._decisions[self._place :], self._taken[self._place :]
-            except _Known as error:
-                result = self._known[error.place]
-                del self._decisions[self._place :], self._taken[self._place :]
-            decisions = zip(self._decisions, self._taken, strict=True)
-            way = [(tuple(each.weights[n] for n in each.possible), taken) for each, taken in decisions]
-            leaves.append((way, result))
-            if not self._next():
-                break
-        else:
-            raise InputError(f"{self._where}: one step has more than {MOST_BRANCHES:,} random outcomes")
+        self._met = {}
+        leaves, again = list[_Leaf](), set[_Place]()
+        for result in self._every_run(lambda: self._run_or_place(step)):
+            known = self._known.get(result.place) if isinstance(result, _Place) else None
+            if known is None and isinstance(result, _Place):
+                again.add(result)
+            shares = [*(each.share for each in self._decisions), self._share()]
+            leaves.append(_Leaf(tuple(self._taken), shares, known or {result: Fraction(1)}))
         if self._remembers:
             again |= {_Place(place, way) for place, way in self._met.items()}
         follows = {place: self._following(leaves, place.way) for place in again}
-        whole = self._fold(leaves, 0)
+        whole = self._following(leaves, (0, ()))
         for place in follows:
             self.check_time(len(leaves))
             self._substitute(place, follows, whole)
         if self._remembers:
             self._known |= {place.place: found for place, found in follows.items()}
-        return {result[0]: share for result, share in whole.items()}, frozenset(
-            each.place[0] for each in again
-        )
+        return whole, frozenset(each.place[0] for each in again)
 
-    def _following(self, leaves: list[Leaf], way: Way) -> dict[Any, Fraction]:
+    def _following(self, leaves: list[_Leaf], way: Way) -> dict[Any, Fraction]:
         """What follows a draw, by the way to it."""
         self.check_time(len(leaves))
         depth, taken = way
-        return self._fold([each for each in leaves if tuple(t for _, t in each[0][:depth]) == taken], depth)
+        found: dict[Any, Fraction] = {}
+        for leaf in leaves:
+            if leaf.taken[:depth] == taken:
+                (before, of), (numerator, denominator) = leaf.shares[depth], leaf.shares[-1]
+                share = Fraction(numerator * of, denominator * before)
+                for result, part in leaf.results.items():
+                    found[result] = found.get(result, Fraction(0)) + share * part
+        return found
 
     def _substitute(
         self, place: _Place, follows: dict[_Place, dict[Any, Fraction]], whole: dict[Any, Fraction]
@@ -258,19 +244,6 @@ class Rejecting(Branching):
             if other is not found and (share := other.pop(place, None)) is not None:
                 for result, part in found.items():
                     other[result] = other.get(result, Fraction(0)) + share * part
-
-    def _fold(self, leaves: list[Leaf], depth: int) -> dict[Any, Fraction]:
-        if len(leaves[0][0]) == depth:
-            return dict(leaves[0][1])
-        groups: dict[int, list[Leaf]] = {}
-        for leaf in leaves:
-            groups.setdefault(leaf[0][depth][1], []).append(leaf)
-        whole: dict[Any, Fraction] = {}
-        for taken, group in groups.items():
-            weights = group[0][0][depth][0]
-            for result, part in self._fold(group, depth + 1).items():
-                whole[result] = whole.get(result, Fraction(0)) + Fraction(weights[taken], sum(weights)) * part
-        return whole
 
     def _differs(self, step: Callable[[], Any], expected: dict[Any, Fraction], places: Any) -> bool:
         """Whether real draws are not as frequent as their shares; a false alarm once in 1e9."""
