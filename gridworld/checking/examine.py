@@ -252,8 +252,8 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
     if mdp is not None:
         with contextlib.suppress(InputError):  # there is no finite optimum
             best = Evaluator(mdp, seen.gamma, seen.limit or UNLIMITED).optimum
-            earned, length = best.expected_return + 0.0, best.expected_length
-            earned = f"returns {earned:.4g} in {length:.4g} step{'s' * (length != 1)}"
+            length = best.expected_length
+            earned = f"returns {best.expected_return + 0.0:.4g} in {length:.4g} step{'s' * (length != 1)}"
             ends = f"terminates in {_episodes(1 - best.timeout)}"
             yield "best policy", f"{earned}, and {ends} (exact, for gamma={seen.gamma:g})"
 

@@ -275,7 +275,7 @@ def _ranges_around(code: CodeType, at: int) -> tuple[str, ...] | None:
     None if there is a loop of another kind, whose iterator nobody sees, or one that sets its variable.
     """
     found = list(dis.get_instructions(code))
-    names = []
+    names: list[str] = []
     for place, loop in enumerate(found):
         if loop.opname == "FOR_ITER" and loop.offset <= at < loop.argval:
             sets = [_set_by(each) for each in found if loop.offset < each.offset < loop.argval]
