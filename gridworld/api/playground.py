@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from html import escape
 from os import PathLike
 from typing import Any
@@ -13,11 +14,11 @@ from gridworld.base.user_input import as_path, limited
 from gridworld.report.playground.page import FRAME, page_of
 
 
+@dataclass(frozen=True, repr=False)
 class Playground:
     """The page that solves a world, lets Q-learning learn in it, and looks into a run; `html` is its text."""
 
-    def __init__(self, html: str) -> None:
-        self.html = html
+    html: str
 
     def _repr_html_(self) -> str:
         return FRAME.format(f'srcdoc="{escape(self.html)}"')

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gridworld.base.atomic_write import make_folder, write_text
-from gridworld.base.console import printable, program, telling_if_slow
+from gridworld.base.console import printable, telling_if_slow
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import limited
 from gridworld.commands import parser_of
@@ -40,10 +40,7 @@ def main(arguments: Sequence[str]) -> None:
     write_text(path, page)
     print(printable(str(path)))
     if out is None and not webbrowser.open(path.absolute().as_uri()):
-        print(
-            printable(f"{program('playground')}: no browser found here; open {path} in yours"),
-            file=sys.stderr,
-        )
+        print(printable(f"no browser found here; open {path} in yours"), file=sys.stderr)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -51,11 +48,7 @@ def _parser() -> argparse.ArgumentParser:
         "playground", __doc__, "--best", "--trust", "--config-dir", example="cliff --out cliff.html"
     )
     option = parser.add_argument
-    option(
-        "words",
-        nargs="*",
-        metavar="WORLD",
-        help="e.g. cliff, my_map.txt, env=maze env.slip=0.1, or runs/2026-...",
-    )
+    example = "e.g. cliff, my_map.txt, env=maze env.slip=0.1, or runs/2026-..."
+    option("words", nargs="*", metavar="WORLD", help=example)
     option("--out", type=Path, metavar="FILE", help="write the page there (.html), and do not open it")
     return parser

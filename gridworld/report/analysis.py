@@ -26,7 +26,7 @@ from gridworld.report.evidence import (
     read,
 )
 from gridworld.report.grouping import Group, Study, arrange
-from gridworld.report.playground.page import fits, has_link, link
+from gridworld.report.playground.page import fits, link
 from gridworld.report.statistics import Interval, Share
 from gridworld.report.tuning_study import TuningStudy, find_tunings
 from gridworld.run.provenance import versions
@@ -80,7 +80,7 @@ def _reference(run: Evidence) -> Reference:
         )
     returns = evaluator.optimum.expected_return, random.outcome.expected_return
     limit = env.step_limit(mdp)
-    address = link(mdp, run.gamma, limit) if has_link(mdp) and fits(mdp) else None
+    address = link(mdp, run.gamma, limit) if fits(mdp) else None
     return Reference(run.optimal_value, returns[0], random.value, returns[1], problem, address)
 
 

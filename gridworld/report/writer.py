@@ -175,17 +175,13 @@ def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
         colours={agent: look["color"] for agent, look in _look(report).items()},
         tables=tables,
         is_finite=math.isfinite,
-        pictures=_pictures,
+        pictures=lambda task: [
+            (result.group.agent, pictures) for result in task.ranked if (pictures := list(_embedded(result)))
+        ],
         sweep_answer=sweep_answer,
         plain=plain,
         base64=lambda content: base64.b64encode(content).decode(),
     )
-
-
-def _pictures(task: TaskAnalysis) -> list[tuple[str, list[dict[str, Any]]]]:
-    """The agents that have pictures, the best first, each with those that are embedded."""
-    found = [(result.group.agent, list(_embedded(result))) for result in task.ranked]
-    return [(agent, pictures) for agent, pictures in found if pictures]
 
 
 def _embedded(result: Result) -> Iterator[dict[str, Any]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
-from helpers.browser import chromium
+from helpers.browser import FITS, chromium
 from helpers.support import ROOT
 
 FORMULA = re.compile(r"\$\$.+?\$\$|\$.+?\$", re.DOTALL)
@@ -68,10 +68,7 @@ def test_the_first_screen_says_how_to_start_and_where_to_go(site: Path, tmp_path
         assert all(Path(unquote(urlsplit(link).path)).is_file() for link in links)
         browser.execute_script("arguments[0].scrollIntoView()", frame)
         browser.switch_to.frame(frame)
-        browser.execute_async_script("setTimeout(arguments[0], 500)")
-        height = browser.execute_script("return document.body.offsetHeight")
-        browser.switch_to.default_content()
-        assert frame.size["height"] == height
+        browser.execute_async_script(FITS)
 
 
 @pytest.mark.slow

@@ -9,6 +9,14 @@ from typing import Any
 
 import pytest
 
+# In a frame that becomes as high as its page: waits until it is, without a scroll bar; fails if it never is.
+FITS = """
+const [done] = arguments, page = document.documentElement;
+const fits = () => Math.ceil(document.body.getBoundingClientRect().height) === innerHeight;
+const look = () => (fits() && page.clientWidth === innerWidth ? done() : setTimeout(look, 20));
+look();
+"""
+
 
 @contextmanager
 def chromium(profile: Path) -> Iterator[Any]:

@@ -335,8 +335,8 @@ function start() {
   $("copy-link").hidden = !hasAddress;
   if (isEmbedded) {
     document.documentElement.className = "embedded";
-    const tell = () => parent.postMessage({ playground: document.body.offsetHeight }, "*"); // `FRAME` of page.py listens
-    new ResizeObserver(tell).observe(document.body);
+    const high = () => Math.ceil(document.body.getBoundingClientRect().height);
+    new ResizeObserver(() => parent.postMessage({ playground: high() }, "*")).observe(document.body); // to `FRAME`
   }
   requestAnimationFrame(frame);
 }

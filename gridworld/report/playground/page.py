@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 import yaml
@@ -71,16 +71,7 @@ def page_of(words: Sequence[str], conf: Sequence[str] = (), best: bool = False, 
 
 
 def world_page(mdp: Mdp, gamma: float, step_limit: int) -> str:
-    """The page of a world.
-
-    Args:
-        mdp: the world; one that is not a map is shown as a table of its states.
-        gamma: the discount of value and regret.
-        step_limit: of an episode.
-
-    Raises:
-        InputError: the world is too large.
-    """
+    """The page of a world; one that is not a map is shown as a table of its states."""
     return _page(_world(mdp, gamma, step_limit))
 
 
@@ -90,11 +81,7 @@ def maps_page() -> str:
 
 
 def run_page(saved: SavedRun) -> str:
-    """The page of a run: its world, and the policies that it kept while it learnt, the last one with its Q.
-
-    Raises:
-        InputError: the world is too large, or the run's files are damaged.
-    """
+    """The page of a run: its world, and the policies it kept while it learned, the last one with its Q."""
     mdp, config, evaluator = saved.mdp, saved.config, saved.evaluator()
     data = _world(mdp, config.evaluation.gamma, evaluator.max_episode_steps)
     last, steps = saved.snapshot(), saved.steps()
@@ -128,13 +115,10 @@ def run_page(saved: SavedRun) -> str:
     return _page(data)
 
 
-def has_link(mdp: Mdp) -> TypeGuard[GridMdp]:
-    """Whether a link can hold the world: a map without rewards of its own."""
-    return isinstance(mdp, GridMdp) and not mdp.layout.ends
-
-
-def link(mdp: GridMdp, gamma: float, step_limit: int) -> str:
-    """What follows `#` in the page's address for the world of a map; `readLink` in world.js reads it."""
+def link(mdp: Mdp, gamma: float, step_limit: int) -> str | None:
+    """What follows `#` in the page's address, for `readLink` in world.js; None: a link cannot hold it."""
+    if not isinstance(mdp, GridMdp) or mdp.layout.ends:
+        return None
     settings = {key: getattr(mdp, key) for key in _SETTINGS}
     settings |= {"max_episode_steps": step_limit, "gamma": gamma}
     tiles = mdp.text().replace("#", "W").replace("\n", "_")
@@ -155,8 +139,8 @@ def _world(mdp: Mdp, gamma: float, step_limit: int) -> dict[str, Any]:
             f"maps of at most {_MOST_SIDE} rows and columns, with {_MOST_OUTCOMES:,} outcomes of all actions"
         )
     data: dict[str, Any] = {"shipped": shipped(), "title": _name(mdp.name), "gamma": gamma}
-    if has_link(mdp):
-        return data | {"link": link(mdp, gamma, step_limit)}
+    if address := link(mdp, gamma, step_limit):
+        return data | {"link": address}
     arrays = {
         "next": mdp.next_state,
         "prob": mdp.probability,
@@ -218,23 +202,14 @@ def _kept(saved: SavedRun, damage: list[str]) -> list[Moment]:
     return []
 
 
-@cache
-def _parts() -> tuple[str, str, str]:
-    """The template, the style and the script."""
+def _page(data: dict[str, Any]) -> str:
     template, style, *modules = (
         files(__package__).joinpath(name).read_text("utf-8")
         for name in ("page.html", "style.css", *(f"{module}.js" for module in _MODULES))
     )
     script = "".join(re.sub(r"^export ", "", _IMPORT.sub("", text), flags=re.MULTILINE) for text in modules)
-    return template, style, script
-
-
-def _page(data: dict[str, Any]) -> str:
-    template, style, script = _parts()
     text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    head, rest = template.split("/* style.css */")
-    body, rest = rest.split("/* data */")
-    middle, end = rest.split("/* script */")
+    head, body, middle, end = re.split(r"/\* [\w.]+ \*/", template)
     return "".join((head, style, body, text, middle, script, end))
 
 
