@@ -156,6 +156,13 @@ def _make_printable(record: logging.LogRecord) -> bool:
     return True
 
 
+def coloured(verdict: str, is_good: bool) -> str:
+    """A verdict, on a terminal green or red; plain in a pipe or a file, and where `NO_COLOR` is set."""
+    if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not sys.stdout.isatty():
+        return verdict
+    return f"\x1b[{32 if is_good else 31}m{verdict}\x1b[0m"
+
+
 def tell(text: str) -> None:
     """Print a note on a run as one line on standard error, and log it."""
     print(printable(text), file=sys.stderr)
@@ -194,10 +201,16 @@ class ProgressLine:
         self._shown = ""
 
     def show(self, text: Callable[[], str]) -> None:
-        """Print the line that `text` returns, which is called if one is due; without its label if long."""
+        """Print the line that `text` returns, which is called if one is due.
+
+        Where it is too long, it lacks its label, and then its last parts.
+        """
         if self._enabled and self._in_place:
             line, room = text(), shutil.get_terminal_size(_SIZE_OF_NOTEBOOK).columns - 1
-            line = line if len(line) <= room else line.split(": ", 1)[-1][:room]
+            line = line if len(line) <= room else line.split(": ", 1)[-1]
+            while len(line) > room and ", " in line:
+                line = line.rpartition(", ")[0]
+            line = line[:room]
             print(f"\r{line:<{len(self._shown)}}", end="", file=sys.stderr, flush=True)
             self._shown = line
         elif self._enabled and time.monotonic() - self._printed >= self._seconds_between_lines:
@@ -230,7 +243,7 @@ class Progress(ProgressLine):
         self._first = self._first if self._first[1] else (step, now)
         first, begun = self._first
         left = time_left(step - first, total - step, now - begun) if step < total else ""
-        self.show(lambda: f"{self._label}: step {step:,} of {total:,} ({step / total:.0%}), {note}{left}")
+        self.show(lambda: f"{self._label}: step {step:,} of {total:,} ({step / total:.0%}){left}, {note}")
 
 
 _is_telling: ContextVar[bool] = ContextVar("is_telling", default=False)

@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from gridworld.base.console import printable
+from gridworld.base.console import coloured, printable
 from gridworld.checking.files import add_file_options, check_files, write_files
 from gridworld.checking.function import OBSERVATIONS
 from gridworld.checking.probes import PROBES
@@ -38,7 +38,7 @@ def main(words: Sequence[str]) -> None:
         worlds=options.world,
         on_finding=lambda finding: print(*map(printable, str(finding).splitlines()), sep="\n", flush=True),
     )
-    print(printable(result.verdict()))
+    print(coloured(printable(result.verdict()), result.passed))
     write_files(result, options)
     if not result.passed:
         sys.exit(_FAILED)

@@ -6,7 +6,7 @@ import argparse
 import shutil
 from collections.abc import Sequence
 
-from gridworld.base.console import aligned, printable, program, telling_if_slow
+from gridworld.base.console import aligned, coloured, printable, program, telling_if_slow
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import limited
 from gridworld.commands import parser_of, whole
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str]) -> None:
     of = f"{options.run} (best model, step {saved.steps():,})" if options.best else options.run
     print(printable(f"{options.policy} policy of {of} on {evaluator.mdp.name}"))
     print(table)
-    print(f"  {verdict}")
+    print(f"  {coloured(verdict, score.certified)}")
     if score.scope != BY_CONSTRUCTION:
         print(printable(f"  world: {score.scope}"))
 

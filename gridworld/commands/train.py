@@ -27,7 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.base.atomic_write import check_no_links
 from gridworld.base.bounds import digits
-from gridworld.base.console import tell_error
+from gridworld.base.console import tell, tell_error
 from gridworld.base.errors import EXIT_CODE, InputError
 from gridworld.base.user_input import called_from, limited
 from gridworld.base.workarounds import let_hydra_parse
@@ -35,7 +35,7 @@ from gridworld.commands.manual import manual
 from gridworld.config.compose import VERSION_BASE, completed, refuse_unused, register_schemas, to_config
 from gridworld.config.messages import sentence
 from gridworld.config.recipes import Chosen
-from gridworld.config.train import TrainConfig
+from gridworld.config.train import TrainConfig, check
 from gridworld.config.words import conf_folder, own_conf_folders, refuse_unclear
 from gridworld.config.worlds import each_once
 from gridworld.run.folder import MANIFEST, SWEEP_JSON, alone_in, check_inside, claimed, shell_path
@@ -179,6 +179,11 @@ def run_job(settings: DictConfig) -> float:
 
 def _train(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
     """Train, or resume the run, in a folder that this process holds; returns the final regret."""
+    check(config)
+    config.agent.check(config)
+    if config.logging.progress and not is_started(folder):  # at once, since torch takes seconds to import
+        world, steps = config.env.name, config.total_timesteps
+        tell(f"training {config.agent.name} on {world}, seed {config.seed}, for {steps:,} steps")
     from gridworld.run.summary import Summary, train_and_tell
     from gridworld.training.train import train
 

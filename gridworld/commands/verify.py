@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from gridworld.base.console import printable, tell_error, telling_if_slow
+from gridworld.base.console import coloured, printable, tell_error, telling_if_slow
 from gridworld.base.errors import EXIT_CODE, InputError
 from gridworld.base.user_input import limited
 from gridworld.commands import parser_of
@@ -67,7 +67,8 @@ def _verified(folder: Path, options: argparse.Namespace) -> tuple[Verified, bool
         verified = proven(evaluator, saved.snapshot().greedy)
     is_certified = bool(saved.run.read_summary().get("certified")) and not options.best
     mdp, gamma = evaluator.mdp, evaluator.solution.gamma
-    print(printable(f"{folder} on {mdp.name}, discount {gamma:g}: {verified}"))
+    shown = coloured(printable(str(verified)), verified.is_optimal)
+    print(f"{printable(f'{folder} on {mdp.name}, discount {gamma:g}')}: {shown}")
     print(printable(f"  world: {mdp.scope}"), flush=True)
     return verified, is_certified
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gridworld.base.console import aligned, printable
+from gridworld.base.console import aligned, coloured, printable
 from gridworld.base.signals import Interrupted
 from gridworld.base.user_input import users_folder
 from gridworld.run.folder import EVENTS, RunFolder, shell_path
@@ -34,8 +34,9 @@ def train_and_tell(
         run = read_run(folder)
         print(interruption_text(interruption, run, run.manifest), file=sys.stderr)
         sys.exit(interruption.exit_code)
-    place = shell_path(folder)
-    print(summary_text(summary, place, [] if summary["certified"] else advise(folder)))
+    is_good, shown = summary["certified"], printable(verdict(summary))
+    text = summary_text(summary, shell_path(folder), [] if is_good else advise(folder))
+    print(text.replace(f"\n  {shown}\n", f"\n  {coloured(shown, is_good)}\n"))
     if any(folder.glob(EVENTS)):
         print(f"  curves: tensorboard --logdir {shell_path(_logs(folder.absolute()))}", flush=True)
     return summary

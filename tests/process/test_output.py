@@ -62,20 +62,57 @@ def test_progress(
     shown = capsys.readouterr().err.removesuffix("\n")
     start, middle, end = shown.removeprefix("\r").split("\r" if in_place else "\n")
     assert start == r"dqn on\x1bmap: step 0 of 2,000 (0%), a long note"
-    assert middle.rstrip() == r"dqn on\x1bmap: step 1,000 of 2,000 (50%), b, about 0 s left"
+    assert middle.rstrip() == r"dqn on\x1bmap: step 1,000 of 2,000 (50%), about 0 s left, b"
     assert end.rstrip() == r"dqn on\x1bmap: step 2,000 of 2,000 (100%), c"
     assert (len(end) == len(middle)) == in_place  # a line covers the one before
     console.Progress(10, "x", enabled=False).update(1, "y")
     assert capsys.readouterr().err == ""
 
 
-def test_progress_on_a_narrow_terminal_keeps_the_regret(
+def test_progress_on_a_narrow_terminal_keeps_the_time_left_and_the_regret(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "60")
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    console.Progress(200_000, "expected_sarsa on frozen_lake_4x4").update(1_000, "regret 0.542, goal 50%")
+    progress = console.Progress(200_000, "expected_sarsa on frozen_lake_4x4")
+    progress.update(1_000, "regret 0.542, goal 50%")
     assert capsys.readouterr().err == "\rstep 1,000 of 200,000 (0%), regret 0.542, goal 50%"
+    progress.update(2_000, "regret 0.542, goal 50%, certified optimal")
+    assert capsys.readouterr().err.rstrip() == "\rstep 2,000 of 200,000 (1%), about 0 s left, regret 0.542"
+
+
+READ = """
+import os, pty, sys
+status = pty.spawn(sys.argv[1:])
+sys.exit(os.waitstatus_to_exitcode(status))
+"""
+
+
+@pytest.mark.parametrize(
+    ("variables", "is_coloured"), [({}, True), ({"NO_COLOR": "1"}, False), ({"TERM": "dumb"}, False)]
+)
+def test_a_verdict_is_coloured_on_a_terminal_alone(
+    variables: dict[str, str], is_coloured: bool, tmp_path: Path
+) -> None:
+    train_in(tmp_path / "run", *SHORT["value_iteration"], "recording.learning=false")
+    variables = {"TERM": "xterm", "NO_COLOR": "", **variables}
+    (tmp_path / "read.py").write_text(READ)
+    line = "SCRIPT evaluate.py run --episodes 10"
+    shown = shell(f"{sys.executable} read.py {line} </dev/null", tmp_path, **variables).stdout.decode()
+    assert ("  \x1b[32mcertified optimal: " in shown) == is_coloured
+    assert ("\x1b" in shown) == is_coloured
+    assert b"  certified optimal: " in shell(line, tmp_path, **variables).stdout
+
+
+def test_a_run_says_what_it_trains_before_torch_is_imported(tmp_path: Path) -> None:
+    """Where torch cannot be imported, it is the line before the error; a refused setting has no such line."""
+    (tmp_path / "torch.py").write_text("raise ImportError('slow')")
+    begin, path = b"training dqn on classic, seed 3, for ", f"{tmp_path}:{ROOT}"
+    for more, is_said in (("", True), ("logging.progress=false", False), ("agent.tau=-1", False)):
+        line = f"SCRIPT train.py agent=dqn seed=3 hydra.run.dir=run {more}"
+        said = shell(line, tmp_path, PYTHONPATH=path).stderr
+        assert said.startswith(begin) == is_said
+        assert (b"slow" in said) == ("tau" not in more)
 
 
 def test_names_in_a_locale_without_utf8(tmp_path: Path) -> None:
