@@ -208,7 +208,7 @@ def acts_as_learned(trained: Trained) -> str:
     best = solved(trained.mdp, trained.gamma).optimal
     steps = int(trained.late.sum())
     if steps == 0:
-        return "takes no steps"
+        raise UnknownError("takes no steps at the end")
     share = float(trained.late[best].sum()) / steps
     if share < LEAST_BEST:
         raise UnmetError(f"{share:.0%} of its last actions are optimal, must be {LEAST_BEST:.0%}")

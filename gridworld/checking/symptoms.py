@@ -96,7 +96,7 @@ def _seed(seen: Seen) -> Iterator[EnvFinding]:
             f"another environment changes this one: they share {names}, as of a class, a module or a default "
             "argument."
         )
-        advice = "make it anew in __init__(); a batch has several environments, and so has an evaluation."
+        advice = "create it in __init__(); a batch and an evaluation have environments beside each other."
         yield EnvFinding("reset", ERROR, evidence, advice)
 
 

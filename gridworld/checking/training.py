@@ -197,7 +197,7 @@ def train(config: AgentConfig, mdp: Mdp, gamma: float, num_envs: int, steps: int
     if predict is not None:  # a table has none
         actions, _ = predict(context.observation.table(), deterministic=True)
         greedy = one_hot_policy(np.asarray(actions).astype(np.int64), mdp.num_actions)
-    unknown = getattr(agent, "unknown", {})
+    unknown = {**({} if before else {"parameters": "has no layers"}), **getattr(agent, "unknown", {})}
     return Trained(mdp, gamma, first, agent.snapshot(), greedy, visits, visits - earlier, frozen, unknown)
 
 

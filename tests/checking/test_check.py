@@ -65,7 +65,10 @@ def test_a_table_passes_all_it_is_asked() -> None:
     result = gridworld.check("value_iteration")
     assert result.passed, str(result)
     asked = [finding for finding in result.findings if finding.passed is not None]
-    assert len(asked) == len(PROBES) - 3  # target, entropy, exploration
+    assert len(asked) == len(PROBES) - 5  # target, entropy, exploration, layers, behaviour
+    unasked = {finding.name: finding.found for finding in result.findings if finding.passed is None}
+    assert unasked["layers"] == "has no layers"
+    assert unasked["behaviour"] == "takes no steps at the end"
     assert f"passed all {len(asked)} probes" in str(result)
 
 
