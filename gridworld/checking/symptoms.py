@@ -96,7 +96,7 @@ def _seed(seen: Seen) -> Iterator[EnvFinding]:
             f"another environment changes this one: they share {names}, as of a class, a module or a default "
             "argument."
         )
-        advice = "create it in __init__(); a batch and an evaluation have environments beside each other."
+        advice = "create it in __init__(); batches and evaluations have several environments at a time."
         yield EnvFinding("reset", ERROR, evidence, advice)
 
 
