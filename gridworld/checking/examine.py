@@ -252,10 +252,9 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
     if mdp is not None:
         with contextlib.suppress(InputError):  # there is no finite optimum
             best = Evaluator(mdp, seen.gamma, seen.limit or UNLIMITED).optimum
-            length = best.expected_length
-            earned = f"returns {best.expected_return + 0.0:.4g} in {length:.4g} step{'s' * (length != 1)}"
-            ends = f"terminates in {_episodes(1 - best.timeout)}"
-            yield "best policy", f"{earned}, and {ends} (exact, for gamma={seen.gamma:g})"
+            earned, length = f"{best.expected_return + 0.0:.4g}", f"{best.expected_length:.4g}"
+            found = f"returns {earned} in {length} step{'s' * (length != '1')}, and terminates in"
+            yield "best policy", f"{found} {_episodes(1 - best.timeout)} (exact, for gamma={seen.gamma:g})"
 
 
 def _episodes(share: float) -> str:

@@ -249,11 +249,8 @@ def _try_ends(found: Replays, make: Callable[[], Env], sampled: Steps, left: flo
             begin = end - int(sampled.time[end])
             if (left := left - (end - begin)) < 0:
                 return
-            actions, used, same = (
-                [sampled.acts[act] for act in sampled.action[begin : end + 1]],
-                make(),
-                make(),
-            )
+            actions = [sampled.acts[act] for act in sampled.action[begin : end + 1]]
+            used, same = make(), make()
             for env in (used, same):
                 _play(env, actions, begin, set())
             if _play(used, usual[0], SEEDS[0], set()) != usual[1]:

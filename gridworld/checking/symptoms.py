@@ -116,10 +116,7 @@ def _ends(seen: Seen) -> Iterator[EnvFinding]:
             f"gymnasium.wrappers.TimeLimit(env, {limit}).",
         )
     ended, is_long = steps.terminated[last] | steps.truncated[last], (lengths >= LONGEST).any()
-    never, how = (
-        bool(not ended.any() and is_long),
-        f"none of {len(lengths)} episodes ended in {LONGEST:,} steps",
-    )
+    never, how = not ended.any() and is_long, f"none of {len(lengths)} episodes ended in {LONGEST:,} steps"
     if mdp is not None:
         never, how = not bool(mdp.terminal[mdp.reachable].any()), "no state that can be reached is an end"
     if never and seen.limit is None:
@@ -296,18 +293,6 @@ def _checker(seen: Seen) -> Iterator[EnvFinding]:
 
 
 ALL: tuple[Callable[[Seen], Iterator[EnvFinding]], ...] = (
-    *(
-        _interface,
-        _spaces,
-        _values,
-        _seed,
-        _ends,
-        _actions,
-        _reward,
-        _scale,
-        _discount,
-        _observation,
-        _markov,
-    ),
-    _checker,
+    *(_interface, _spaces, _values, _seed, _ends, _actions, _reward, _scale),
+    *(_discount, _observation, _markov, _checker),
 )
