@@ -116,7 +116,8 @@ def _ends(seen: Seen) -> Iterator[EnvFinding]:
             f"gymnasium.wrappers.TimeLimit(env, {limit}).",
         )
     ended, is_long = steps.terminated[last] | steps.truncated[last], (lengths >= LONGEST).any()
-    never, how = not ended.any() and is_long, f"none of {len(lengths)} episodes ended in {LONGEST:,} steps"
+    never = bool(not ended.any() and is_long)
+    how = f"none of {len(lengths)} episodes ended in {LONGEST:,} steps"
     if mdp is not None:
         never, how = not bool(mdp.terminal[mdp.reachable].any()), "no state that can be reached is an end"
     if never and seen.limit is None:
