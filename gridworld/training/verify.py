@@ -11,6 +11,7 @@ import gzip
 import json
 import math
 import os
+import stat
 from dataclasses import dataclass, field
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from importlib.util import module_from_spec
@@ -87,12 +88,14 @@ def check_certificate_file(path: Path) -> None:
         if not path.absolute().parent.is_dir():
             raise InputError(f"{path}: there is no folder {path.parent}")
         check_writable(path.absolute().parent, "file")
-        begins = b"" if os.path.lexists(path) else _BEGINS
-        if path.is_file() and not path.is_symlink():
+        begins = b""
+        if stat.S_ISREG(path.lstat().st_mode):
             with (gzip.open if path.name.endswith(".gz") else open)(path, "rb") as file:
                 begins = file.read(len(_BEGINS))
         if begins != _BEGINS:
             raise InputError(f"{path}: is there and not a certificate; choose a new file")
+    except FileNotFoundError:
+        return
     except InputError:
         raise
     except (OSError, EOFError, ValueError) as error:

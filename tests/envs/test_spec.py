@@ -127,7 +127,7 @@ def test_draw_object(env):
     assert not disc[:404].any()
     assert not disc[496:].any()
     triangle = drawn(env.get_coords(1, 3, "interior_triangle"))
-    assert triangle.sum() == pytest.approx(66 * 66 / 2, rel=0.05)
+    assert triangle.sum() == pytest.approx(66 * 66 / 2, rel=0.07)  # pygame-ce draws its edges wider
     assert triangle[450, 280]
     assert not triangle[430, 280]
     square = drawn(env.get_coords(1, 3, "interior_corners"))

@@ -85,7 +85,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         lambda text: re.sub(r'("lower": {"0": )[\d.e-]+', rf"\g<1>-{10**400}", text),
         "too large",
     ),
-    "deep": (lambda text: "[" * 100_000, "recursion"),
+    "deep": (lambda text: "[" * 100_000, "while decoding"),
 }
 
 
