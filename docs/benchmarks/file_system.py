@@ -21,7 +21,7 @@ from benchmarks.measure import Comparison, Workload
 from gridworld.config.train import PICTURES
 
 _RUN = ("agent=dqn", "total_timesteps=2000", "evaluation.every=500", "logging.progress=false")
-_NO_PICTURES = tuple(f"recording.{picture.setting}=false" for picture in PICTURES)
+_NO_PICTURES = tuple(f"recording.{name}=false" for name in PICTURES)
 _SETTINGS = {
     "all that a run writes": (),
     "without recording.frames": ("recording.frames=false",),

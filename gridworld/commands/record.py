@@ -20,7 +20,7 @@ from gridworld.visualization import files
 from gridworld.visualization.episode import film
 from gridworld.visualization.picture import Subject, drawer
 
-MAPS = {picture.name: picture.drawer for picture in PICTURES if picture.is_map}
+MAPS = {picture.name: picture.drawer for picture in PICTURES.values() if picture.is_map}
 
 
 @limited()

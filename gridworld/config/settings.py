@@ -21,14 +21,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 from gridworld.base.console import printable
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import LIBRARIES, users_folder
-from gridworld.config.fields import (
-    Effect,
-    Privilege,
-    Text,
-    Use,
-    WholeNumbers,
-    declared,
-)
+from gridworld.config.fields import Effect, Privilege, Text, Use, WholeNumbers, declared
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig, TuneConfig
 from gridworld.config.train import AgentConfig, TrainConfig
 from gridworld.config.worlds import SOURCES, EnvConfig, schema_of

@@ -8,7 +8,7 @@ Hydra refuses a misspelt key or a wrong type, `check` numbers outside of the bou
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -130,7 +130,6 @@ class Picture:
     drawer: str  # "module.function" in `gridworld.visualization`, which draws it
     caption: str | None = None  # in a report's page; None: it has no place there
     while_training: bool = False  # TensorBoard has it every `logging.policy_map_every` evaluations
-    setting: str = ""  # its name in `recording.*`
 
     @property
     def name(self) -> str:
@@ -158,11 +157,8 @@ class RecordingConfig:
     fps: int = setting(4, Bounds(1, 100))  # frames a second
 
 
-PICTURES: tuple[Picture, ...] = tuple(
-    replace(found[Picture], setting=name)
-    for name, found in declared(RecordingConfig).items()
-    if Picture in found
-)
+# By the names of their settings.
+PICTURES = {name: found[Picture] for name, found in declared(RecordingConfig).items() if Picture in found}
 
 
 @dataclass

@@ -188,7 +188,7 @@ def _embedded(result: Result) -> Iterator[dict[str, Any]]:
     """The pictures of the run with the median regret that are there, unchanged and not too large."""
     ranked = sorted(result.group.runs, key=lambda run: (run.regret, run.seed))
     run = ranked[(len(ranked) - 1) // 2]
-    for picture in PICTURES:
+    for picture in PICTURES.values():
         path = run.folder / picture.file
         if picture.caption is None or picture.file not in run.pictures:
             continue

@@ -50,7 +50,9 @@ WORLD = "world.npz"
 BEST_MODEL = "best_model.zip"  # these two as SB3's EvalCallback names them
 EVALUATIONS = "evaluations.npz"
 RESULTS = (CURVE, SUMMARY, MODEL, BEST_MODEL, VISITS, EVALUATIONS)
-PICTURES = tuple(each.file for each in schema.PICTURES if Path(each.file).suffix)  # those of one file
+PICTURES = tuple(
+    each.file for each in schema.PICTURES.values() if Path(each.file).suffix
+)  # those of one file
 CHECKED = (*RESULTS, WORLD, *PICTURES)  # what has a checksum in the manifest of a finished run
 CHECKPOINTS = "checkpoints"
 EVENTS = "events.out.tfevents.*"
@@ -62,7 +64,7 @@ SWEEP_JSON = "sweep.json"  # a sweep's folder has this instead of a manifest
 
 # Patterns of all that training writes, except the manifest.
 OUTPUTS = (
-    *(*RESULTS, WORLD, *(each.file for each in schema.PICTURES)),
+    *(*RESULTS, WORLD, *(each.file for each in schema.PICTURES.values())),
     *(CHECKPOINTS, TRAIN_LOG, ERROR_FILE, EVENTS, "source*.diff"),
 )
 

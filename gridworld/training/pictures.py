@@ -82,8 +82,8 @@ class Pictures:
         if self._config.logging.policy_map_every and self._shown_at != evaluation.step:
             self._show_development(evaluation)
         subject, prepared = self._subject(evaluation, self._visits), dict[str, Draw]()
-        for picture in PICTURES:
-            if not getattr(self._config.recording, picture.setting):
+        for name, picture in PICTURES.items():
+            if not getattr(self._config.recording, name):
                 continue
             # The files of one episode are left out with one warning.
             label = picture.file if picture.caption else f"the {picture.drawer.partition('.')[0]}"
@@ -99,7 +99,7 @@ class Pictures:
         self._shown_at = evaluation.step
         # Without visits: an evaluation may be written some steps after its own, when they have grown.
         subject = self._subject(evaluation, np.zeros_like(self._visits))
-        for picture in PICTURES:
+        for picture in PICTURES.values():
             if picture.while_training and self._events is not None:
                 with self._left_out_if_too_large(f"TensorBoard's {picture.name}"):
                     self._show(picture, drawer(picture.drawer)(subject), evaluation.step)

@@ -76,14 +76,14 @@ def import_for(config: TrainConfig) -> None:
     from gridworld.visualization.picture import drawer
 
     config.agent.import_libraries()
-    for picture in PICTURES:
-        if getattr(config.recording, picture.setting):
+    for name, picture in PICTURES.items():
+        if getattr(config.recording, name):
             drawer(picture.drawer)
 
 
 def without_pictures(config: TrainConfig) -> TrainConfig:
     """The same settings without pictures, which take time, or an extra that may be missing."""
-    none = dict.fromkeys((picture.setting for picture in PICTURES), False)
+    none = dict.fromkeys(PICTURES, False)
     return dataclasses.replace(
         config,
         recording=dataclasses.replace(config.recording, **none),

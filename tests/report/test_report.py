@@ -711,7 +711,7 @@ def test_pictures_are_embedded_within_bounds(maker: Maker, tmp_path: Path) -> No
     (median / "visits.png").write_bytes((median / "policy.png").read_bytes()[:200])  # cut off
     frames = [Image.new("P", (40, 30), index) for index in (0, 1)]
     frames[0].save(median / "learning.gif", save_all=True, append_images=frames[1:])
-    for picture in PICTURES:
+    for picture in PICTURES.values():
         if picture.caption:
             seal(median, picture.file)
     Image.new("RGB", (90, 50)).save(tmp_path / "0" / "policy.png")  # of another run

@@ -113,7 +113,7 @@ CASES: list[tuple[str, int, tuple[Telling, ...]]] = [
     ("run/model.zip", 30, (evaluated, reproduced)),
     ("run/visits.npy", 20, (recorded, shown, reproduced)),
     ("run/checkpoints/000000002000.state", 20, (shown,)),
-    *((f"run/{picture.file}", 5, (reported,)) for picture in PICTURES if picture.caption),
+    *((f"run/{picture.file}", 5, (reported,)) for picture in PICTURES.values() if picture.caption),
     ("sweep/sweep.json", 20, (listed,)),
     ("sweep/seed=0/manifest.json", 20, (listed,)),
     ("sweep/seed=0/summary.json", 10, (listed,)),

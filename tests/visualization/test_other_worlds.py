@@ -225,7 +225,7 @@ def test_every_picture_can_be_drawn_of_any_world(world: Mdp, tmp_path: Path) -> 
     shape = (world.num_states, world.num_actions)
     rng = np.random.default_rng(0)
     of_it = subject(world, rng.normal(size=shape), rng.integers(0, 9, shape))
-    for picture in PICTURES:
+    for picture in PICTURES.values():
         if picture.file.endswith((".png", ".gif")):
             prepared = drawer(picture.drawer)(of_it)
             drawn = prepared(None)
