@@ -206,6 +206,7 @@ def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
         yield name, value
 
 
+@functools.lru_cache(maxsize=1000)  # a stranger's names may be any
 def texts(name: str) -> frozenset[Text]:
     """What the text of a setting of a run is; nothing for a number, code where no schema knows."""
     hints = _at(name, settings_of_a_run(), (Annotated[Any, Text.UNKNOWN],))
