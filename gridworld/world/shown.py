@@ -18,7 +18,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError, on_a_line
-from gridworld.base.user_input import check_memory
+from gridworld.base.user_input import DAMAGED, check_memory
 
 _LONGEST_NAME = 60  # of a state that is called by its observation
 _MOST_NAMED = 4  # numbers of an observation
@@ -114,12 +114,12 @@ def space_text(space: gym.Space[Any]) -> str:
         return json.dumps({"Dict": [[key, space_text(each)] for key, each in space.spaces.items()]})
     if isinstance(space, spaces.Box):
         bounds = (
-            [
+            [0, 0]
+            if not space.low.size
+            else [
                 each.flat[0].item() if (each == each.flat[0]).all() else each.tolist()
                 for each in (space.low, space.high)
             ]
-            if space.low.size
-            else [0, 0]
         )
         return json.dumps({"Box": [*bounds, list(space.shape), space.dtype.str]})
     if isinstance(space, spaces.Discrete):
@@ -150,16 +150,7 @@ def space_of_text(text: str, where: str) -> gym.Space[Any]:
             return spaces.MultiBinary(given if len(given) > 1 else given[0])
     except InputError:
         raise
-    except (
-        ValueError,
-        TypeError,
-        LookupError,
-        AssertionError,
-        AttributeError,
-        OverflowError,
-        RecursionError,
-        MemoryError,
-    ):
+    except (*DAMAGED, AssertionError, AttributeError):
         pass
     raise InputError(f"{where}: own_space is not a space of observations")
 

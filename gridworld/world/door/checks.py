@@ -66,7 +66,7 @@ def walk(search: Search, kind: type, look: Callable[[bool], None] = lambda _: No
 
 def _steps(search: Search, kind: type, numbers: np.random.Generator) -> Iterator[Any]:
     yield search.seen.digest(search.layers.env.reset(**search.layers.reset_options)[0])
-    counters = search.layers.counters.values()
+    counters = search.layers.counters
     for took in range(1, _WALK + 1):
         if counters:  # whose stand-ins come with a copy
             search.layers.put(search.layers.take())

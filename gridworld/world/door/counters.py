@@ -186,8 +186,7 @@ for _name in _READING:
 
 def counted(search: Search) -> int | None:
     """The step in which a counter cuts every episode, as far as one was met."""
-    counters = search.layers.counters.values()
-    return min((limit for each in counters for limit in each.limits), default=None)
+    return min((limit for each in search.layers.counters for limit in each.limits), default=None)
 
 
 def check_cuts(search: Search, state: State, steps: list[list[Step]]) -> None:
@@ -196,7 +195,7 @@ def check_cuts(search: Search, state: State, steps: list[list[Step]]) -> None:
     Raises:
         Read: what compares a counter does something else, or only in some states.
     """
-    for counter in search.layers.counters.values():
+    for counter in search.layers.counters:
         if counter.limits and not counter.only_cuts:
             if counter.num_checked < search.num_tried or not _only_cuts(search, state, steps, counter):
                 raise Read({counter.key})

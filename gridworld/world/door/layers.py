@@ -98,8 +98,7 @@ class Layers:
         self._names: dict[tuple[str, ...], int] = {}  # of attributes that are copied: their numbers in copies
         self._digest_left = b""
         self.read: set[tuple[int, str]] = set()  # attributes that something has read
-        self.counters: dict[tuple[int, str], Counter] = {}  # numbers that change, and that nothing has read
-        self._counted: list[list[tuple[str, Counter]]] = [[] for _ in self.layers]  # the same by layers
+        self._counters: list[dict[str, Counter]] = [{} for _ in self.layers]  # numbers that nothing has read
         self._compares_forms = False  # whether what a stand-in was made from counts in a copy
         # Those that cannot be replaced, with their states.
         self._generators = [(each, state_of(each)) for _, each in generators_of(holders)]
@@ -145,7 +144,7 @@ class Layers:
         held = [attributes(layer) for layer in self.layers]
         self._check_closures(held)
         try:
-            copy = self._load(self._dump([list(each.items()) for each in held]))
+            copy = self._load(self.dump([list(each.items()) for each in held]))
         except Exception as error:
             raise self._uncopied(held, error) from error
         finally:
@@ -185,7 +184,7 @@ class Layers:
         for each in held:
             for name, value in each.items():
                 try:
-                    self._dump(value)
+                    self.dump(value)
                 except Exception as reason:
                     return InputError(
                         f"{self._where}: its attribute {name} cannot be copied ({in_short(reason)}); hold "
@@ -200,13 +199,12 @@ class Layers:
         has the numbers in some episodes, after the reset and each step.
         """
         self._left, self._known, self._shares = [{} for _ in self.layers], self.fixed, False
-        self.counters, self._counted = {}, [[] for _ in self.layers]
-        for key in changing - self.read:
-            values = [[now[key] for now in each if key in now] for each in series]
-            self.counters[key] = counter = Counter(key, values)
-            self._counted[key[0]].append((key[1], counter))
-            *outer, layer = self.layers[: key[0] + 1]
-            counter.is_limit = known.is_limit(layer) and key[1] == "_elapsed_steps"
+        self._counters = [{} for _ in self.layers]
+        for number, name in changing - self.read:
+            values = [[now[number, name] for now in each if (number, name) in now] for each in series]
+            counter = self._counters[number][name] = Counter((number, name), values)
+            *outer, layer = self.layers[: number + 1]
+            counter.is_limit = known.is_limit(layer) and name == "_elapsed_steps"
             counter.only_cuts = counter.is_limit and all(map(known.steps_once, outer))
             self._keep(counter.blank)
         most = _LARGE if len(self.take()) > _SMALL else math.inf
@@ -214,7 +212,7 @@ class Layers:
             {
                 name: value
                 for name, value in attributes(layer).items()
-                if (number, name) not in changing and (self._is_one(value) or len(self._dump(value)) > most)
+                if (number, name) not in changing and (self._is_one(value) or len(self.dump(value)) > most)
             }
             for number, layer in enumerate(self.layers)
         ]
@@ -231,7 +229,7 @@ class Layers:
         return type(value) in ATOMS or id(value) in self.fixed
 
     def _content_left(self) -> bytes:
-        return self._dump(self._left, self.fixed)
+        return self.dump(self._left, self.fixed)
 
     def changed_left(self) -> list[tuple[int, str]]:
         """All that was left in place, if some of it has changed after all."""
@@ -252,17 +250,17 @@ class Layers:
             if names not in self._names:
                 self._names[names] = len(self._names)
             parts.append([self._names[names], *held.values()])
-        return self._dump(parts)
+        return self.dump(parts)
 
     def _held(self, without: Sequence[str] = ()) -> list[dict[str, Any]]:
         held = []
-        for layer, left, counters in zip(self.layers, self._left, self._counted, strict=True):
+        for layer, left, counters in zip(self.layers, self._left, self._counters, strict=True):
             found = attributes(layer)
             for name, value in left.items():
                 now = found.pop(name, Changed)
                 if now is not value and not (type(now) is type(value) in ATOMS and now == value):
                     raise Changed([(self.layers.index(layer), name)])
-            for name, counter in counters:
+            for name, counter in counters.items():
                 if name in found and (type(found[name]) in NUMBERS or type(found[name]) is Unread):
                     found[name] = counter.blank
             held.append({name: found[name] for name in sorted(found) if name not in without})
@@ -272,18 +270,25 @@ class Layers:
         """Make a copy the state of all layers; numbers that are counted may be compared in a step alone."""
         names = list(self._names)
         for layer, left, counters, (number, *values) in zip(
-            self.layers, self._left, self._counted, self._load(copy), strict=True
+            self.layers, self._left, self._counters, self._load(copy), strict=True
         ):
             held = dict(zip(names[number], values, strict=True)) | left
-            for name, counter in counters if is_step_next else ():
+            for name, counter in counters.items() if is_step_next else ():
                 if type(held.get(name)) is Unread:
                     held[name] = counter.fresh()
             set_attributes(layer, held)
 
+    @property
+    def counters(self) -> list[Counter]:
+        """What is known of numbers that change, and that nothing has read."""
+        return [counter for each in self._counters for counter in each.values()]
+
     def check_counters(self, is_reset: bool) -> None:
         """Note how numbers that are counted have changed in a reset or a step."""
-        for (number, name), counter in self.counters.items():
-            counter.check(attributes(self.layers[number]).get(name), is_reset)
+        for layer, counters in zip(self.layers, self._counters, strict=True):
+            held = attributes(layer) if counters else {}
+            for name, counter in counters.items():
+                counter.check(held.get(name), is_reset)
 
     def numbers(self) -> dict[tuple[int, str], Any]:
         """The attributes that are numbers."""
@@ -296,7 +301,7 @@ class Layers:
 
     def uncertain(self) -> set[Key]:
         """The counters of which it is not known that they do no more than cut episodes."""
-        return {key for key, counter in self.counters.items() if not counter.only_cuts}
+        return {counter.key for counter in self.counters if not counter.only_cuts}
 
     def check_shared(self) -> None:
         """Begin anew if an object that is kept for its modules and classes has changed: then it is state."""
@@ -308,7 +313,7 @@ class Layers:
         found, met = {}, self.met_shared.copy()
         for key in keys:
             with contextlib.suppress(Exception):  # of anybody's
-                found[key] = self._dump(attributes(self.shared[key]), self.fixed)
+                found[key] = self.dump(attributes(self.shared[key]), self.fixed)
         self.met_shared = met  # without what they hold of each other
         return found
 
@@ -322,13 +327,9 @@ class Layers:
         """A copy of every attribute, and of `more`; what cannot be copied raises whatever it raises."""
         self._compares_forms = True
         try:
-            return self._dump([*more, *(attributes(layer) for layer in self.layers)], self.fixed)
+            return self.dump([*more, *map(attributes, self.layers)], self.fixed)
         finally:
             self._compares_forms = False
-
-    def copy_of(self, thing: Any) -> bytes:
-        """A copy of something that may hold the layers."""
-        return self._dump(thing)
 
     def names(self) -> list[str]:
         """The names of all attributes."""
@@ -340,14 +341,15 @@ class Layers:
         for number, held in enumerate(self._held(ignore)):
             for name, value in held.items():
                 try:
-                    found[number, name] = self._dump(value)
+                    found[number, name] = self.dump(value)
                 except InputError:
                     raise
                 except Exception as error:  # whatever the classes in it raise
                     raise self._uncopied([{name: value}], error) from error
         return found
 
-    def _dump(self, thing: Any, known_objects: dict[Any, Any] | None = None) -> bytes:
+    def dump(self, thing: Any, known_objects: dict[Any, Any] | None = None) -> bytes:
+        """A copy of something that may hold the layers, in which what is known is kept as it is."""
         buffer = io.BytesIO()
         known_objects = self._known if known_objects is None else known_objects
         shares = self._shares and known_objects is self._known

@@ -186,7 +186,7 @@ class Search:
         """All that a step's rest depends on, with what the functions between hold."""
         if self._read is None:
             return self.layers.everything(*held)
-        return self.layers.copy_of((self._read(self.layers.base), held))
+        return self.layers.dump((self._read(self.layers.base), held))
 
     def _explore(self) -> None:
         self.states: list[State] = []

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import EnumType
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -103,10 +104,8 @@ class _World:
         self.members = [*(members[number] for number in range(len(members))), []]
         classes.append(len(members))  # what is over, as the last
         limit, self._cuts_end = step_limit(search)
-        first = [
-            [[self._in_classes(each, classes) for each in row] for row in found[0].steps]
-            for found in self.members[:-1]
-        ]
+        of_classes = partial(_in_classes, classes=classes, cuts_end=self._cuts_end)
+        first = [[list(map(of_classes, row)) for row in found[0].steps] for found in self.members[:-1]]
         starts = [(each.probability, classes[each.following], each.seen) for each in search.resets.starts]
         budget = search.budget
         self.beliefs = beliefs = Beliefs(
@@ -119,7 +118,7 @@ class _World:
             limit,
         )
         space, numbers, size = search.env.observation_space, *self._numbers()
-        named: list[Named] = [self._unreached(number) for number in range(size)]
+        named: list[Named] = [(f"observation {number}", None) for number in range(size)]
         leaves: list[Any] = [None] * size
         masks = np.ones((size, search.num_actions), dtype=np.bool_)
         for node, number in reversed(list(zip(beliefs.nodes, numbers.tolist(), strict=True))):
@@ -151,10 +150,6 @@ class _World:
         shown = taken(rows, mdp.number)
         self.found = Found(mdp, space, shown, masks[mdp.number] if search.has_masks else None)
 
-    def _in_classes(self, step: Step, classes: Sequence[int]) -> Step:
-        ends = step.terminated or (step.truncated and self._cuts_end)
-        return step._replace(following=classes[step.following], terminated=ends)
-
     def _numbers(self) -> tuple[NDArray[Any], int]:
         """The number of each node in the tables, the environment's own if it has such; how many there are."""
         space, nodes = self.search.env.observation_space, self.beliefs.nodes
@@ -163,9 +158,6 @@ class _World:
             shown = [int(self.search.seen.parts[node.seen][0]) - int(space.start) for node in nodes]
             return np.array(shown), int(space.n)
         return np.arange(len(nodes)), len(nodes)
-
-    def _unreached(self, number: int) -> Named:
-        return f"observation {number}", None
 
     def _mask(self, node: Node) -> tuple[bool, ...]:
         """The actions that are allowed where a node's observation is shown."""
@@ -204,6 +196,11 @@ class _World:
         return f"{found}; the clock is read ({', '.join(readers[:3])})" if readers else found
 
 
+def _in_classes(step: Step, classes: Sequence[int], cuts_end: bool) -> Step:
+    ends = step.terminated or (step.truncated and cuts_end)
+    return step._replace(following=classes[step.following], terminated=ends)
+
+
 def _action_names(search: Search) -> list[str] | None:
     """The names in an enumeration `actions`, if the environment has one that fits."""
     actions = getattr(search.env.unwrapped, "actions", None)
@@ -231,7 +228,7 @@ def traits(env: Env) -> Any:
     constant: dict[Any, Any] = {
         key: held[key] if isinstance(held[key], gym.Space | EnvSpec) else value
         for key, value in before.items()
-        if after.get(key) == value and held[key] is not branching
+        if key[1] != "env" and after.get(key) == value and held[key] is not branching
     }
     return [type(each) for each in search.layers.layers], constant, shown
 

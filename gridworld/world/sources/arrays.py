@@ -26,13 +26,11 @@ A run's world holds the fields of an `Mdp` as they are. What other programs writ
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
-import zipfile
 from collections.abc import Callable, Mapping
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Dict
@@ -40,7 +38,6 @@ from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError, in_short
 from gridworld.base.user_input import (
-    DAMAGED,
     check_memory,
     named_object,
     npz_arrays,
@@ -49,9 +46,7 @@ from gridworld.base.user_input import (
 )
 from gridworld.world.mdp import Mdp, frozen, leaves_of
 from gridworld.world.outcomes import (
-    MOST_STATES,
     Outcomes,
-    check_size,
     checked_text,
     mdp_from_outcomes,
     verified,
@@ -231,8 +226,6 @@ def _read(path: str | PathLike[str]) -> bytes:
                     f"env.path={given}: is larger than {most / 2**20:,.0f} MiB; give a smaller world"
                 )
             check_memory(given, 2 * size)
-            _check_shapes(f"env.path={given}", file)
-            file.seek(0)
             return file.read(_MOST_BYTES)
     except InputError:
         raise
@@ -241,29 +234,6 @@ def _read(path: str | PathLike[str]) -> bytes:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", error)
         raise InputError(f"env.path={given}: cannot be read ({reason}); give {_FILES}") from None
-
-
-def _check_shapes(where: str, file: BinaryIO) -> None:
-    """Refuse arrays that no world has by what their headers say, before they are read."""
-    try:
-        with zipfile.ZipFile(file) as archive:
-            for info in archive.infolist():
-                with archive.open(info) as member:
-                    is_first = np.lib.format.read_magic(member) == (1, 0)
-                    form = np.lib.format
-                    read = form.read_array_header_1_0 if is_first else form.read_array_header_2_0
-                    shape, _, _ = read(member)
-                    name = info.filename.removesuffix(".npy")
-                    if name in _MATRICES and len(shape) == 3:
-                        check_size(where, shape[1], shape[0], shape[2])
-                    elif name in _TABLES and len(shape) > 1:
-                        check_size(where, shape[0], shape[1], math.prod(shape[2:]))
-                    elif math.prod(shape[:1]) > MOST_STATES:
-                        raise InputError(f"{where}: {name} has {shape[0]:,} entries, too many for a world")
-    except InputError:
-        raise
-    except DAMAGED:  # which reading it says in its own words
-        return
 
 
 def world_bytes(mdp: Mdp) -> bytes:

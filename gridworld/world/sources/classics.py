@@ -8,11 +8,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError
 from gridworld.world.mdp import Mdp, grid_places
-from gridworld.world.outcomes import MOST_ACTIONS, MOST_STATES, Outcomes, mdp_from_outcomes
+from gridworld.world.outcomes import MOST_ACTIONS, MOST_STATES
+from gridworld.world.sources.arrays import mdp_from_arrays
 
 LEFT, RIGHT = 0, 1
 _LEFT_RIGHT = ("left", "right")
@@ -50,7 +50,9 @@ def river_swim(length: int = 6) -> Mdp:
     reward[0, LEFT], reward[-1, RIGHT] = 0.005, 1.0
     return _world(
         f"RiverSwim {length}",
-        (next_state, reward, np.zeros(next_state.shape, dtype=np.bool_)),
+        next_state=next_state,
+        reward=reward,
+        terminated=np.zeros(next_state.shape, dtype=np.bool_),
         probability=probability,
         action_names=_LEFT_RIGHT,
         places=grid_places(1, length),
@@ -93,9 +95,11 @@ def deep_sea(size: int = 10, seed: int | None = None) -> Mdp:
     places = np.stack([np.zeros(cells, np.int64), row, col], axis=1)
     return _world(
         f"DeepSea {size}",
-        (next_state, reward, terminated),
+        next_state=next_state,
+        reward=reward,
+        terminated=terminated,
         success=success,
-        action_names=_LEFT_RIGHT if seed is None else None,
+        action_names=_LEFT_RIGHT if seed is None else ("0", "1"),
         places=np.concatenate([places, [[-1, -1, -1]]]),
         max_episode_steps=size,
     )
@@ -128,7 +132,9 @@ def combination_lock(length: int = 10, num_actions: int = 2, seed: int | None = 
     next_state[length], terminated[length] = length, True
     return _world(
         f"combination lock {length}",
-        (next_state, reward, terminated),
+        next_state=next_state,
+        reward=reward,
+        terminated=terminated,
         places=grid_places(1, length + 1),
         max_episode_steps=10 * length,
     )
@@ -157,33 +163,19 @@ def random_walk(length: int = 5) -> Mdp:
     terminated = (next_state == 0) | (next_state == length + 1)
     return _world(
         f"random walk {length}",
-        (next_state, reward, terminated),
+        next_state=next_state,
+        reward=reward,
+        terminated=terminated,
         start=(length + 1) // 2,
         action_names=_LEFT_RIGHT,
         places=grid_places(1, length + 2),
     )
 
 
-def _world(
-    name: str,
-    tables: tuple[NDArray[Any], NDArray[np.float64], NDArray[np.bool_]],
-    start: int = 0,
-    success: NDArray[np.bool_] | None = None,
-    probability: NDArray[np.float64] | None = None,
-    **settings: Any,
-) -> Mdp:
-    """The world of next states, rewards and ends, (N, A) or with `probability` (N, A, K)."""
-    given: dict[str, Any] = {
-        "next_state": tables[0],
-        "reward": tables[1],
-        "terminated": tables[2],
-        "success": success,
-    }
-    if probability is None:
-        given = {key: None if table is None else table[:, :, None] for key, table in given.items()}
-        probability = np.ones((*tables[0].shape, 1))
-    first = (np.arange(len(probability)) == start).astype(np.float64)
-    return mdp_from_outcomes(name, Outcomes(probability=probability, start=first, **given), **settings)
+def _world(name: str, start: int = 0, **arrays: Any) -> Mdp:
+    """The world of arrays, in the terms of `gridworld.world.sources.arrays`, that starts in one state."""
+    first = np.eye(1, len(arrays["next_state"]), start)[0]
+    return mdp_from_arrays(name, {"start": first, **arrays}, name)
 
 
 def _check_whole(key: str, value: Any, least: int, most: int) -> None:
