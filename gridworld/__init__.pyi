@@ -17,8 +17,6 @@ from gridworld.api.worlds import compile_env as compile_env
 from gridworld.api.worlds import evaluate as evaluate
 from gridworld.api.worlds import make_vec as make_vec
 from gridworld.base.errors import InputError as InputError
-from gridworld.checking.examine import ExamineResult as ExamineResult
-from gridworld.checking.examine import examine as examine
 from gridworld.checking.run import CheckResult as CheckResult
 from gridworld.checking.run import check as check
 from gridworld.envs.env import GridWorldEnv as GridWorldEnv
@@ -31,6 +29,8 @@ from gridworld.envs.observations import VectorOneHotObservation as VectorOneHotO
 from gridworld.envs.registration import ENV_ID as ENV_ID
 from gridworld.envs.registration import register_envs as register_envs
 from gridworld.envs.vector_env import GridWorldVectorEnv as GridWorldVectorEnv
+from gridworld.examining.examine import ExamineResult as ExamineResult
+from gridworld.examining.examine import examine as examine
 from gridworld.training.verify import verify as verify
 from gridworld.world.evaluation import Evaluator as Evaluator
 from gridworld.world.evaluation import Score as Score

@@ -87,7 +87,7 @@ LONG = (
     *("report/test_report.py", "config/test_config.py", "commands/test_bad_input.py"),
     *("commands/test_commands.py", "process/test_output.py"),
     *("restore/test_reproduce.py", "restore/test_resume.py", "checking/test_check.py"),
-    *("checking/test_examine.py", "api/test_worlds.py", "restore/test_resume_commands.py"),
+    *("examining/test_examine.py", "api/test_worlds.py", "restore/test_resume_commands.py"),
     "commands/test_train_on_worlds.py",
     *("export/test_export.py", "training/test_training.py"),
     *("agents/sb3/test_custom_code.py", "engine/test_updates.py", "restore/test_resume_states.py"),

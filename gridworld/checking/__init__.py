@@ -3,7 +3,4 @@
 A probe is a row of `probes`: a world, what must hold after training, and what it means where it
 does not. All exact numbers are from the solver. `training` trains an algorithm on a probe's world, and `run`
 runs all probes.
-
-Whether an environment is right: `examine` makes the page of what `sampling` saw and `symptoms` and `hidden`
-found in it.
 """

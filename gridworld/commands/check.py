@@ -12,12 +12,12 @@ import sys
 from collections.abc import Sequence
 
 from gridworld.base.console import coloured, printable
-from gridworld.checking.files import add_file_options, check_files, write_files
 from gridworld.checking.function import OBSERVATIONS
 from gridworld.checking.probes import PROBES
 from gridworld.checking.run import check
 from gridworld.checking.training import arguments
 from gridworld.commands import parser_of, whole
+from gridworld.commands.findings import add_file_options, check_files, write_files
 
 _PROCESSES = 2
 _FAILED = 1  # the exit code

@@ -10,9 +10,9 @@ import sys
 from collections.abc import Sequence
 
 from gridworld.base.console import printable
-from gridworld.checking.examine import examine
-from gridworld.checking.files import add_file_options, check_files, write_files
 from gridworld.commands import parser_of, whole
+from gridworld.commands.findings import add_file_options, check_files, write_files
+from gridworld.examining.examine import examine
 
 _FOUND = 1  # the exit code
 

@@ -15,8 +15,8 @@ from gymnasium import spaces
 
 from gridworld.api.worlds import compile_env
 from gridworld.base.errors import InputError
-from gridworld.checking.examine import examine
 from gridworld.config.compose import named_world
+from gridworld.examining.examine import examine
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import BY_CONSTRUCTION
 from gridworld.world.sources.arrays import mdp_from_arrays

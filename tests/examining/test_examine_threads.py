@@ -14,7 +14,7 @@ import pytest
 from gymnasium.spaces import Box, Dict, Discrete
 from helpers.faulty_envs import Result, Start
 
-from gridworld.checking.examine import examine
+from gridworld.examining.examine import examine
 
 
 class Shower1826(gym.Env[Any, Any]):

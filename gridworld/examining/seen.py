@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from gymnasium import spaces
 
-from gridworld.checking.sampling import Env, Replays, Steps
+from gridworld.examining.sampling import Env, Replays, Steps
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup
 
 UNLIMITED = 10_000  # steps of an episode that are counted where there is no limit

@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 import pytest
 from helpers.support import ROOT
 
-from gridworld.checking import files
-from gridworld.checking.examine import ExamineResult
 from gridworld.checking.run import CheckResult, Finding
 from gridworld.commands import check, examine
+from gridworld.commands import findings as files
+from gridworld.examining.examine import ExamineResult
 
 KEYS = {"format", "command", "name", "passed", "seconds", "facts", "findings"}
 OF_FINDING = {"name", "status", "severity", "found", "advice", "may_follow_from", "seeds", "seconds"}

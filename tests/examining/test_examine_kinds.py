@@ -11,7 +11,7 @@ from helpers.faulty_envs import Result, Slippery, Start, Walk, WrongGoal
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from gridworld.checking.examine import ExamineResult, examine
+from gridworld.examining.examine import ExamineResult, examine
 
 STEPS = 2_000
 

@@ -12,9 +12,9 @@ from xml.etree import ElementTree
 
 from gridworld.base.atomic_write import write_bytes, write_json
 from gridworld.base.console import plain
-from gridworld.checking.examine import ExamineResult
 from gridworld.checking.run import CheckResult
-from gridworld.checking.seen import ERROR
+from gridworld.examining.examine import ExamineResult
+from gridworld.examining.seen import ERROR
 from gridworld.run.folder import check_file
 
 _FORMAT = 1  # of the schema

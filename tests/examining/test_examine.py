@@ -9,8 +9,8 @@ import pytest
 from helpers.faulty_envs import FAULTS, Cart, Lock, Raises
 
 from gridworld.base.errors import InputError
-from gridworld.checking.examine import examine
 from gridworld.commands import examine as command
+from gridworld.examining.examine import examine
 
 STEPS = 4_000
 SOUND = list(dict.fromkeys(sound for sound, *_ in FAULTS))

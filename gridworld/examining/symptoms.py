@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from gymnasium import spaces
 
-from gridworld.checking.hidden import hidden, pays_totals
-from gridworld.checking.sampling import LONGEST, parts_of
-from gridworld.checking.seen import ENDINGS, ERROR, UNLIMITED, WARNING, EnvFinding, Seen
+from gridworld.examining.hidden import hidden, pays_totals
+from gridworld.examining.sampling import LONGEST, parts_of
+from gridworld.examining.seen import ENDINGS, ERROR, UNLIMITED, WARNING, EnvFinding, Seen
 from gridworld.world.metrics import wilson_interval
 
 _LEAST_REACHED = 1e-3  # of episodes of a random policy that come to the reward

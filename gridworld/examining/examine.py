@@ -19,14 +19,14 @@ from gymnasium.utils.env_checker import check_env
 from gridworld.base.bounds import STEP_LIMIT, Bounds, Discount
 from gridworld.base.errors import GYMNASIUM, InputError, in_short, on_a_line
 from gridworld.checking.function import SingleEnv
-from gridworld.checking.sampling import Actions, Env, Replays, generators_restored, replays, sample
-from gridworld.checking.seen import ERROR, UNLIMITED, EnvFinding, Seen
-from gridworld.checking.symptoms import ALL
 from gridworld.config.compose import named_world
 from gridworld.config.worlds import is_id
 from gridworld.envs.inspection import task_of
 from gridworld.envs.observations import make_observation
 from gridworld.envs.vector_env import GridWorldVectorEnv
+from gridworld.examining.sampling import Actions, Env, Replays, generators_restored, replays, sample
+from gridworld.examining.seen import ERROR, UNLIMITED, EnvFinding, Seen
+from gridworld.examining.symptoms import ALL
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 from gridworld.world.metrics import wilson_interval

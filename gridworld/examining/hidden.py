@@ -18,7 +18,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from gridworld.checking.seen import Seen
+from gridworld.examining.seen import Seen
 from gridworld.world.door.attributes import differing, held_by, is_plain
 from gridworld.world.door.counters import counted
 from gridworld.world.door.search import Search, State
