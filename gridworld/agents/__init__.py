@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from gridworld.base.serialization import State
     from gridworld.envs.observations import ObservationTable
-    from gridworld.envs.statistics_env import StatisticsVectorEnv
+    from gridworld.envs.training_env import TrainingVectorEnv
     from gridworld.world.evaluation import PolicySnapshot
 
 WriteScalars = Callable[[Mapping[str, float], int], None]  # ({tag: value}, environment steps)
@@ -28,7 +28,7 @@ SafePoint = Callable[[int], None] | None
 class TrainingContext:
     """What an agent learns on."""
 
-    envs: StatisticsVectorEnv  # which reset in the same step
+    envs: TrainingVectorEnv  # which reset in the same step
     observation: ObservationTable  # what it sees of a state
     seed: int  # of its own random numbers and of the environments'
     device: str  # torch's name of a device, or `auto`

@@ -26,7 +26,7 @@ from gridworld.checking.function import OBSERVATIONS, FunctionConfig
 from gridworld.checking.probes import Probe, Trained
 from gridworld.config.train import AgentConfig
 from gridworld.envs.observations import make_observation
-from gridworld.envs.statistics_env import StatisticsVectorEnv
+from gridworld.envs.training_env import TrainingVectorEnv
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.mdp import Mdp
 
@@ -173,7 +173,7 @@ def build(config: AgentConfig, mdp: Mdp, num_envs: int, seed: int) -> tuple[Agen
     kind = "none" if config.family == "tabular" else "one_hot"
     if isinstance(config, FunctionConfig):
         kind = OBSERVATIONS[config.observation]
-    envs = StatisticsVectorEnv(num_envs, mdp=mdp, max_episode_steps=mdp.max_episode_steps)
+    envs = TrainingVectorEnv(num_envs, mdp=mdp, max_episode_steps=mdp.max_episode_steps)
     context = TrainingContext(envs, make_observation(mdp, kind), seed, "cpu")
     return config.build(context), context
 

@@ -13,7 +13,7 @@ from gridworld.commands import parser_of, whole
 from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.rendering import has_display
 from gridworld.envs.rollout import SampledScores, play, sample_episodes
-from gridworld.run.summary import MOST_NAMED, circles_text, shortfall_text
+from gridworld.run.console import MOST_NAMED, circles_text, shortfall_text
 from gridworld.training.saved_run import SavedRun, choose_policy
 from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.mdp import BY_CONSTRUCTION, FloatArray

@@ -184,7 +184,7 @@ def _train(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
     if config.logging.progress and not is_started(folder):  # at once, since torch takes seconds to import
         world, steps = config.env.name, config.total_timesteps
         tell(f"training {config.agent.name} on {world}, seed {config.seed}, for {steps:,} steps")
-    from gridworld.run.summary import Summary, train_and_tell
+    from gridworld.run.console import Summary, train_and_tell
     from gridworld.training.train import train
 
     run: Callable[[], Summary] = partial(train, config, folder, overrides, _world)
@@ -217,7 +217,7 @@ def resume(words: Sequence[str]) -> None:
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: is read-only; copy the run to a writable folder and resume the copy")
 
-    from gridworld.run.summary import train_and_tell
+    from gridworld.run.console import train_and_tell
     from gridworld.training.resume import open_unfinished  # here, since it takes a second to import
 
     with alone_in(folder):

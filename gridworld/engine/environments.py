@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from gridworld.envs.statistics_env import StatisticsVectorEnv
+from gridworld.envs.training_env import TrainingVectorEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv, StateArray, Step
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
@@ -34,7 +34,7 @@ class Environments(GridWorldVectorEnv):
     The runs' own batches are stale until `put_back`, but for their generators and statistics.
     """
 
-    def __init__(self, batches: Sequence[StatisticsVectorEnv]) -> None:
+    def __init__(self, batches: Sequence[TrainingVectorEnv]) -> None:
         first, runs = batches[0], len(batches)
         super().__init__(
             runs * first.num_envs,

@@ -30,7 +30,7 @@ from gridworld.base.together import mixed
 from gridworld.engine.environments import Environments
 from gridworld.engine.networks import DenseNetworks, Networks, StateNetwork, make_networks
 from gridworld.engine.optimizer import Optimizer
-from gridworld.envs.statistics_env import StatisticsVectorEnv
+from gridworld.envs.training_env import TrainingVectorEnv
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 FEW_STATES = 1024  # up to here all states are cheaper than finding out which ones a batch holds
@@ -43,7 +43,7 @@ class Run:
     model: Any  # SB3's own, for settings, counters and the names of logged values; its weights are stale
     network: StateNetwork
     target: StateNetwork | None  # where it has a target network
-    envs: StatisticsVectorEnv  # for their generator and their statistics
+    envs: TrainingVectorEnv  # for their generator and their statistics
     torch_generator: torch.Generator  # in place of torch's own
     numpy_generator: np.random.RandomState  # in place of numpy's own
     reward_scale: float = 1.0  # that rewards are multiplied by

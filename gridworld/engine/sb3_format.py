@@ -22,7 +22,7 @@ from gridworld.base.serialization import independent_generator
 from gridworld.engine.networks import StateNetwork, cut
 from gridworld.engine.population import Population, Run
 from gridworld.envs.observations import ObservationTable
-from gridworld.envs.statistics_env import StatisticsVectorEnv
+from gridworld.envs.training_env import TrainingVectorEnv
 
 Parameters = Sequence[nn.Parameter]
 
@@ -41,7 +41,7 @@ def algorithm_of(model_class: type[BaseAlgorithm]) -> type[Population] | None:
 def make_run(
     model: BaseAlgorithm,
     observation: ObservationTable,
-    envs: StatisticsVectorEnv,
+    envs: TrainingVectorEnv,
     seed: int,
     **options: Any,
 ) -> Run:

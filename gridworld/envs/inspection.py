@@ -46,7 +46,7 @@ _NEUTRAL, _NATIVE, _COPIES, _PROCESSES, _TABLE, _OURS = (
 )
 _BATCHES = {
     "gridworld.envs.vector_env:GridWorldVectorEnv": _NATIVE,
-    "gridworld.envs.statistics_env:StatisticsVectorEnv": _NATIVE,
+    "gridworld.envs.training_env:TrainingVectorEnv": _NATIVE,
     "gridworld.envs.observations:VectorTableObservation": _TABLE,
     "gymnasium.vector.sync_vector_env:SyncVectorEnv": _COPIES,
     "gymnasium.vector.async_vector_env:AsyncVectorEnv": _PROCESSES,

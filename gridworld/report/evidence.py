@@ -19,9 +19,9 @@ import numpy as np
 from gridworld.base.console import printable
 from gridworld.base.errors import InputError
 from gridworld.config.settings import NEWER, flat, privileges
+from gridworld.run.console import scope_of
 from gridworld.run.folder import CURVE, MANIFEST, SUMMARY, VISITS
 from gridworld.run.reader import ONLINE, REQUIRED, RunReader, check_is_folder, read_columns, read_run
-from gridworld.run.summary import scope_of
 from gridworld.world.mdp import FloatArray
 from gridworld.world.metrics import METRICS
 

@@ -24,7 +24,7 @@ from gridworld.base.errors import InputError
 from gridworld.base.safe_read import csv_text
 from gridworld.base.serialization import State
 from gridworld.config.train import TrainConfig
-from gridworld.envs.statistics_env import NO_EPISODES, Returns, StatisticsVectorEnv
+from gridworld.envs.training_env import NO_EPISODES, Returns, TrainingVectorEnv
 from gridworld.run.writer import NEEDED
 from gridworld.world.evaluation import Evaluator, PolicySnapshot, Score
 from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score, regret_text
@@ -96,7 +96,7 @@ class LearningCurve:
         evaluator: Evaluator,
         agent: Agent,
         config: TrainConfig,
-        envs: StatisticsVectorEnv | None = None,
+        envs: TrainingVectorEnv | None = None,
     ) -> None:
         self.evaluator = evaluator
         self.certificate = Certificate()

@@ -26,10 +26,10 @@ from gridworld.config.settings import flat, foreign
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig, World, compiled
 from gridworld.run.checkpoints import MOST_STEPS, Checkpoints, steps_of
+from gridworld.run.console import Summary
 from gridworld.run.folder import CHECKPOINTS, CURVE
 from gridworld.run.provenance import environment, git, identity, settings, source_differences
 from gridworld.run.reader import RunReader, read_run, stored_world
-from gridworld.run.summary import Summary
 from gridworld.run.writer import RunWriter, TrainLog
 from gridworld.training.learning_curve import CURVE_COLUMNS
 from gridworld.training.saved_run import settings_of

@@ -30,9 +30,9 @@ from gridworld.config.recipes import agent_and_recipe
 from gridworld.config.settings import privileges
 from gridworld.config.train import TrainConfig
 from gridworld.run.checkpoints import Checkpoints, Pace
+from gridworld.run.console import MOST_NAMED, Summary
 from gridworld.run.folder import CURVE, EVENTS
 from gridworld.run.provenance import environment, identity
-from gridworld.run.summary import MOST_NAMED, Summary
 from gridworld.run.writer import RunWriter, write_evaluations
 from gridworld.training.learning_curve import (
     CHARTS,

@@ -15,7 +15,7 @@ from gridworld.config.train import PICTURES, TrainConfig, check
 from gridworld.config.words import CLASSES, conf_folder
 from gridworld.config.worlds import World, compiled
 from gridworld.envs.observations import make_observation
-from gridworld.envs.statistics_env import StatisticsVectorEnv
+from gridworld.envs.training_env import TrainingVectorEnv
 from gridworld.world.chain import Chain, discounted_visits, one_hot_policy, stopping_states
 from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
@@ -49,7 +49,7 @@ def make_context(config: TrainConfig, mdp: Mdp, write_scalars: WriteScalars | No
     """Make `config.n_envs` fresh environments, and what else an agent is built from."""
     share = config.exploring_starts
     return TrainingContext(
-        envs=StatisticsVectorEnv(
+        envs=TrainingVectorEnv(
             config.n_envs,
             exploration_bonus=config.exploration_bonus,
             max_episode_steps=config.env.step_limit(mdp),

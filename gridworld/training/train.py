@@ -19,9 +19,9 @@ from gridworld.base.serialization import State, StateError
 from gridworld.base.signals import Interrupted
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import World, compiled
+from gridworld.run.console import Summary, interruption_text
 from gridworld.run.folder import MANIFEST, RunFolder, shown
 from gridworld.run.reader import is_started
-from gridworld.run.summary import Summary, interruption_text
 from gridworld.run.writer import RunWriter, TrainLog
 from gridworld.training.session import OnBuilt, Session, ignore
 from gridworld.training.setup import check_settings, notes

@@ -19,7 +19,7 @@ from gridworld.config.settings import agent_schemas, foreign, privileges, settin
 from gridworld.config.sweep import TuneConfig
 from gridworld.config.train import TrainConfig, check_bounds
 from gridworld.config.worlds import SOURCES
-from gridworld.run.summary import summary_text
+from gridworld.run.console import summary_text
 
 SECTIONS = (TrainConfig, TuneConfig, *agent_schemas().values(), *SOURCES.values())
 SECTIONS += tuple(type(each) for each in vars(TrainConfig()).values() if dataclasses.is_dataclass(each))

@@ -16,7 +16,7 @@ from gridworld.engine import dqn, on_policy, population
 from gridworld.engine.population import Run
 from gridworld.engine.sb3_format import algorithm_of, make_run, put_weights
 from gridworld.envs.observations import make_observation
-from gridworld.envs.statistics_env import StatisticsVectorEnv
+from gridworld.envs.training_env import TrainingVectorEnv
 
 NUM_ENVS, STEPS = 16, 32
 KINDS = ["one_hot", "coordinates", "none", "image"]
@@ -24,7 +24,7 @@ KINDS = ["one_hot", "coordinates", "none", "image"]
 
 def twins(algorithm: type, kind: str, step_limit: int = 12, **arguments: Any) -> tuple[Run, Any]:
     """A run of the engine and SB3's model with the same weights and generators, in a slippery world."""
-    envs = StatisticsVectorEnv(NUM_ENVS, slip=0.2, max_episode_steps=step_limit)
+    envs = TrainingVectorEnv(NUM_ENVS, slip=0.2, max_episode_steps=step_limit)
     observation = make_observation(envs.mdp, kind)
     policy = "CnnPolicy" if kind == "image" else "MlpPolicy"
     models = []

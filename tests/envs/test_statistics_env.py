@@ -8,7 +8,7 @@ import pytest
 from helpers.support import SHORT, train_in
 
 from gridworld.engine.environments import Environments
-from gridworld.envs.statistics_env import StatisticsVectorEnv
+from gridworld.envs.training_env import TrainingVectorEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv
 
 
@@ -20,7 +20,7 @@ from gridworld.envs.vector_env import GridWorldVectorEnv
 )
 def test_visits_and_returns_are_those_of_a_naive_tally(settings: dict, dtype: type, bonus: float) -> None:
     num_envs, steps = 5, 400
-    counted = StatisticsVectorEnv(num_envs, exploration_bonus=bonus, **settings)
+    counted = TrainingVectorEnv(num_envs, exploration_bonus=bonus, **settings)
     plain = GridWorldVectorEnv(num_envs, autoreset_mode="SameStep", **settings)
     counted.reset(seed=3)
     states, _ = plain.reset(seed=3)
@@ -55,7 +55,7 @@ def test_visits_and_returns_are_those_of_a_naive_tally(settings: dict, dtype: ty
 def test_a_rollout_counted_in_blocks_is_that_counted_step_by_step(bonus: float) -> None:
     """To the last bit: whether an evaluation comes in the middle of a rollout changes no run."""
     settings: dict = {"slip": 0.3, "step_reward": -0.1, "max_episode_steps": 9}
-    rolling, stepping = (StatisticsVectorEnv(6, exploration_bonus=bonus, **settings) for _ in range(2))
+    rolling, stepping = (TrainingVectorEnv(6, exploration_bonus=bonus, **settings) for _ in range(2))
     for envs in (rolling, stepping):
         envs.reset(seed=3)
     environments = Environments([rolling])
@@ -78,7 +78,7 @@ def test_a_rollout_counted_in_blocks_is_that_counted_step_by_step(bonus: float) 
 
 
 def test_an_episode_given_up_is_not_one_that_ended() -> None:
-    envs = StatisticsVectorEnv(2, step_reward=-1, max_episode_steps=3)
+    envs = TrainingVectorEnv(2, step_reward=-1, max_episode_steps=3)
     envs.reset()
     envs.step(np.array([0, 0]))
     envs.reset(options={"reset_mask": np.array([True, False])})

@@ -30,7 +30,7 @@ from gridworld.commands import train as train_command
 from gridworld.config.train import TrainConfig
 from gridworld.report.tables import Table, to_captioned_markdown, to_csv, to_markdown
 from gridworld.report.tuning_study import find_tunings
-from gridworld.run.summary import summary_text
+from gridworld.run.console import summary_text
 from gridworld.sweeps import console, folder
 from gridworld.sweeps.folder import FAILED, JobRow, SweepFolder
 from gridworld.sweeps.plan import Job

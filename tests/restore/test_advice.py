@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from helpers.support import NO_FILES, ROOT, script, train_in
 
+from gridworld.run.console import circles_text
 from gridworld.run.reader import REQUIRED, RunReader
-from gridworld.run.summary import circles_text
 from gridworld.training.advice import _still_falls, advice
 
 SHORT = ["total_timesteps=200", "evaluation.every=20", *NO_FILES]

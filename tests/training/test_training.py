@@ -19,7 +19,7 @@ from PIL import Image
 from gridworld.agents import Agent
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import sealed
-from gridworld.envs.statistics_env import Returns
+from gridworld.envs.training_env import Returns
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.saved_run import SavedRun
 from gridworld.training.together import run_together

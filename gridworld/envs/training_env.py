@@ -41,7 +41,7 @@ class Returns(NamedTuple):
 NO_EPISODES = Returns(0, 0.0)
 
 
-class StatisticsVectorEnv(GridWorldVectorEnv):
+class TrainingVectorEnv(GridWorldVectorEnv):
     """A `GridWorldVectorEnv` that resets in the same step, so that every step is one that an agent chose.
 
     `exploration_bonus` is β, at least 0; `visits` (S, A), int64, counts how often each action was
