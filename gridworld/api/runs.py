@@ -31,7 +31,7 @@ from gridworld.config.worlds import World, each_once
 from gridworld.diagnosis import verdict
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.envs.rendering import Frame
-from gridworld.run import summary as run_summary
+from gridworld.run import console as run_summary
 from gridworld.run.folder import check_inside, claimed
 from gridworld.run.reader import check_free, is_started, read_columns
 from gridworld.training.resume import unfinished_of
