@@ -25,8 +25,17 @@ from gridworld.world.mdp import IntArray
 from gridworld.world.outcomes import Outcomes, check_size
 
 Belief = tuple[tuple[int, Fraction], ...]  # hidden states, ascending, with their probabilities
+_MOST_NODES = 200_000
 _MOST_PARTS = 2_000_000  # hidden states of all beliefs together
 _MOST_BITS = 4_096  # bits of a probability, which a history without end makes longer and longer
+
+
+def summed(parts: Iterable[tuple[Any, Fraction]]) -> dict[Any, Fraction]:
+    """The sum of what belongs to each key."""
+    sums: dict[Any, Fraction] = {}
+    for key, part in parts:
+        sums[key] = sums[key] + part if key in sums else part
+    return sums
 
 
 class Step(NamedTuple):
@@ -59,11 +68,11 @@ def lumped(steps: Sequence[Sequence[Sequence[Step]]], apart: Sequence[Any]) -> l
         for own, rows in zip(classes, steps, strict=True):
             signature: list[Any] = [own]
             for row in rows:
-                sums: dict[Any, Fraction] = {}
-                for probability, following, *shown in row:
-                    key = classes[following] if following >= 0 else following, *shown
-                    sums[key] = sums[key] + probability if key in sums else probability
-                signature.append(frozenset(sums.items()))
+                parts = (
+                    ((classes[following] if following >= 0 else following, *shown), probability)
+                    for probability, following, *shown in row
+                )
+                signature.append(frozenset(summed(parts).items()))
             found.append(numbers.setdefault(tuple(signature), len(numbers)))
         classes = found
     return classes
@@ -90,7 +99,6 @@ class Beliefs:
         starts: the probability of each hidden state and observation after a reset.
         steps: of each hidden state the outcomes of each action; empty where none was tried.
         refusal: makes an error of a reason.
-        most: more nodes are refused.
         most_seconds: the time after which it is given up.
         show: shows how far it is.
         limit: steps of an episode; of a few nodes more, what follows in them is not asked.
@@ -101,12 +109,11 @@ class Beliefs:
         starts: Iterable[tuple[Fraction, int, bytes]],
         steps: Sequence[Sequence[Sequence[Step]]],
         refusal: Callable[[str], InputError],
-        most: int,
-        most_seconds: float = math.inf,
+        most_seconds: float,
         show: Callable[[str], None] = lambda what: None,
         limit: int | None = None,
     ) -> None:
-        self._refusal, self._most, self._num_parts = refusal, most, 0
+        self._refusal, self._most, self._num_parts = refusal, _MOST_NODES, 0
         self._until = time.monotonic() + most_seconds
         self.nodes: list[Node] = []
         self._numbers: dict[tuple[Belief, bytes], int] = {}
@@ -152,9 +159,7 @@ class Beliefs:
             total = parts[0][1]
             belief: Belief = ((parts[0][0], Fraction(1)),)
         else:
-            sums: dict[int, Fraction] = {}
-            for hidden, probability in parts:
-                sums[hidden] = sums.get(hidden, Fraction(0)) + probability
+            sums = summed(parts)
             total = sum(sums.values(), Fraction(0))
             belief = tuple((hidden, sums[hidden] / total) for hidden in sorted(sums))
         key = belief, seen

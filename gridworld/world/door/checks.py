@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from gridworld.world.door.attributes import differing, held_by, innermost, is_plain
-from gridworld.world.door.beliefs import Step
+from gridworld.world.door.beliefs import Step, summed
 from gridworld.world.door.counters import counted
 from gridworld.world.shown import content
 
@@ -58,6 +58,8 @@ def walk(search: Search, kind: type, look: Callable[[bool], None] = lambda _: No
             except Exception as error:  # which the search meets too, and refuses
                 shown.append(str(error))
                 fails = True
+            for counter in search.layers.counters:
+                counter.cuts = False
             look(True)
             if fails:
                 break
@@ -208,12 +210,11 @@ class Resets:
     def check_others(self, classes: Sequence[int]) -> None:
         """Those that led elsewhere must have led to states of the same classes."""
         for (usual, found), copy in self._others.items():
-            shares: list[dict[Any, Fraction]] = [{}, {}]
-            for share, starts in zip(shares, (usual, found), strict=True):
-                for probability, number, seen in starts:
-                    key = classes[number], seen
-                    share[key] = share.get(key, Fraction(0)) + probability
-            if shares[0] != shares[1]:
+            before, after = (
+                summed(((classes[number], seen), probability) for probability, number, seen in starts)
+                for starts in (usual, found)
+            )
+            if before != after:
                 self._refuse(copy)
 
     def _refuse(self, copy: bytes) -> NoReturn:

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import functools
 import operator
+import sys
 from collections.abc import Callable, Iterator, Sequence
-from fractions import Fraction
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
+from gymnasium.wrappers import TimeLimit
 
-from gridworld.world.door.beliefs import Step
+from gridworld.world.door.beliefs import Step, summed
 
 if TYPE_CHECKING:
     from gridworld.world.door.search import Search, State
@@ -113,16 +114,19 @@ class Counter:
     def _changes(
         self, compare: Callable[[Any, Any], bool], form: tuple[int, int], threshold: Any
     ) -> tuple[bool, int | None]:
-        """What a comparison gives in the first step, and in which one it gives the other, if in any."""
+        """What a comparison gives at first, and in which step it gives the other, if in any."""
         sign, offset = form
 
         def outcome(step: int) -> bool:
             return bool(compare(sign * (self.start + self.step * (step - 1)) + offset, threshold))
 
-        slope = sign * self.step
-        usual, crossing = outcome(1), int((threshold - sign * self.start - offset) // slope) + 1
-        near = [step for step in range(crossing - 1, crossing + 3) if step > 1 and outcome(step) is not usual]
-        return usual, min(near, default=None)
+        slope, first = (
+            sign * self.step,
+            0 if self.is_limit else 1,
+        )  # a `TimeLimit` may cut the first step, too
+        usual, crossing = outcome(first), int((threshold - sign * self.start - offset) // slope) + 1
+        steps = [step for step in range(crossing - 1, crossing + 3) if step > first]
+        return usual, min((step for step in steps if outcome(step) is not usual), default=None)
 
 
 class Unread:
@@ -151,7 +155,8 @@ class Unread:
 
     def _compared(self, name: str, other: Any) -> bool:
         is_number = type(other) in NUMBERS and abs(other) <= _EXACT  # which no NaN is
-        if self.form is None or not is_number or not self.counter.is_regular:
+        is_others = self.counter.is_limit and sys._getframe(1).f_code is not TimeLimit.step.__code__
+        if self.form is None or not is_number or not self.counter.is_regular or is_others:
             self._read()
         return self.counter.compared(name, self.form, other)
 
@@ -207,14 +212,13 @@ def _only_cuts(search: Search, state: State, steps: list[list[Step]], limit: Cou
     try:
         for action, usual in enumerate(steps):
             run = functools.partial(search.stepped_from, state.copy, state.depth, np.int64(action))
-            cut: dict[Any, Fraction] = {}
-            for (_, *shown), probability in search.branching.outcomes(run).items():
-                key = (*shown[:3], shown[2] or shown[3])
-                cut[key] = cut.get(key, Fraction(0)) + probability
-            whole: dict[Any, Fraction] = {}
-            for each in usual:
-                key = (each.seen, each.reward, each.terminated, True)
-                whole[key] = whole.get(key, Fraction(0)) + each.probability
+            cut = summed(
+                ((*shown[:3], shown[2] or shown[3]), probability)
+                for (_, *shown), probability in search.branching.outcomes(run).items()
+            )
+            whole = summed(
+                ((each.seen, each.reward, each.terminated, True), each.probability) for each in usual
+            )
             if cut != whole:
                 return False
     finally:

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from gridworld.base.errors import InputError
+from gridworld.world.door.beliefs import summed
 from gridworld.world.door.branching import OURS, Branching, Result, Share
 
 OURS |= {__file__, functools.__file__}
@@ -52,6 +53,11 @@ class _Leaf:
     taken: tuple[int, ...]
     shares: list[Share]
     results: dict[Any, Fraction]
+
+    def share_after(self, depth: int) -> Fraction:
+        """Its share of all runs that took the same so far."""
+        (before, of), (numerator, denominator) = self.shares[depth], self.shares[-1]
+        return Fraction(numerator * of, denominator * before)
 
 
 class _Again(BaseException):  # which an environment's `except Exception` does not catch
@@ -222,14 +228,13 @@ class Rejecting(Branching):
         """What follows a draw, by the way to it."""
         self.check_time(len(leaves))
         depth, taken = way
-        found: dict[Any, Fraction] = {}
-        for leaf in leaves:
-            if leaf.taken[:depth] == taken:
-                (before, of), (numerator, denominator) = leaf.shares[depth], leaf.shares[-1]
-                share = Fraction(numerator * of, denominator * before)
-                for result, part in leaf.results.items():
-                    found[result] = found.get(result, Fraction(0)) + share * part
-        return found
+        return summed(
+            (result, share * part)
+            for leaf in leaves
+            if leaf.taken[:depth] == taken
+            for share in (leaf.share_after(depth),)
+            for result, part in leaf.results.items()
+        )
 
     def _substitute(
         self, place: _Place, follows: dict[_Place, dict[Any, Fraction]], whole: dict[Any, Fraction]

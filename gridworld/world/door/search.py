@@ -89,6 +89,7 @@ class Search:
     ) -> None:
         self.where, self.env, self.ignore = where, env, tuple(ignore)
         self._compares, self._kept = compares, 1 if keeps_copies else SAMPLED  # the copy of one in so many
+        self.is_by_word = state is not None
         self._read = state or known.state_reader(env.unwrapped)
         actions = env.action_space
         if not isinstance(actions, spaces.Discrete) or actions.start != 0 or actions.n > MOST_ACTIONS:

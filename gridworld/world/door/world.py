@@ -14,7 +14,7 @@ nothing. An end is a success if it pays more than 0, and if none does, if it pay
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import EnumType
 from functools import partial
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from gridworld.base.user_input import check_memory
 from gridworld.world.door.attributes import GENERATORS, attributes
 from gridworld.world.door.beliefs import Beliefs, Node, Step
-from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES
+from gridworld.world.door.budget import MOST_STATES
 from gridworld.world.door.checks import walk
 from gridworld.world.door.counters import step_limit
 from gridworld.world.door.known import Named
@@ -58,36 +58,16 @@ class Found:
     masks: NDArray[np.bool_] | None
 
 
-def enumerated(
-    where: str,
-    env: Env,
-    *,
-    name: str = "",
-    ignore: Sequence[str] = (),
-    state: Callable[[Any], Any] | None = None,
-    most_states: int = MOST_STATES,
-    most_seconds: float = MOST_SECONDS,
-    compares: bool = True,
-) -> Found:
+def enumerated(where: str, env: Env, *, name: str = "", **bounds: Any) -> Found:
     """Find the world of an environment, wrappers included, which is left as it was.
 
-    Args:
-        where: what messages call it.
-        env: the environment.
-        name: of the world; its class's if none is given.
-        ignore: attributes that are no part of its state, by the user's word.
-        state: a function of the environment without wrappers that is its whole state, by the user's word.
-        most_states: more are refused as soon as they are found.
-        most_seconds: a search that takes longer is refused.
-        compares: whether shares found by rejection are compared with real draws.
-
-    Raises:
-        InputError: it has no such world, or none within these bounds.
+    Without a name it is called by its class; `where` and `bounds`: see `Search`. Raises InputError where it
+    has no such world, or none within these bounds.
     """
-    search = Search(where, env, ignore, state, most_states, most_seconds, compares)
+    search = Search(where, env, **bounds)
     try:
         search.explore()
-        return _World(search, name or type(env.unwrapped).__name__, by_word=state is not None).found
+        return _World(search, name or type(env.unwrapped).__name__).found
     finally:
         search.budget.clear()
 
@@ -95,8 +75,8 @@ def enumerated(
 class _World:
     """The world of what a search found; its states are `beliefs` about the environment's own."""
 
-    def __init__(self, search: Search, name: str, by_word: bool) -> None:
-        self.search, self._by_word = search, by_word
+    def __init__(self, search: Search, name: str) -> None:
+        self.search = search
         classes = list(search.classes)
         members: dict[int, list[State]] = {}
         for state, number in zip(search.states, classes, strict=True):
@@ -112,7 +92,6 @@ class _World:
             starts,
             [*first, []],
             search.refusal,
-            MOST_STATES,
             budget.seconds_left(),
             budget.show,
             limit,
@@ -183,7 +162,7 @@ class _World:
 
     def _truth(self) -> str:
         ignored = f" without {', '.join(self.search.ignore)}, as you asked" if self.search.ignore else ""
-        without = f"{ignored}, of which state= says all" if self._by_word else ignored
+        without = f"{ignored}, of which state= says all" if self.search.is_by_word else ignored
         size, nodes = len(self.members) - 1, self.beliefs.nodes
         if all(len(each.belief) == 1 for each in nodes):
             found = f"{ENUMERATED}, {len(nodes):,} states{without}"

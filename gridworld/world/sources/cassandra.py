@@ -28,7 +28,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _LISTS = {"states": "state", "actions": "action", "observations": "observation"}
 _AXES = {"T": "ast", "O": "ato", "R": "asto"}  # of each table: action, state, state that follows, observation
 _CALLED = {"a": "action", "s": "state", "t": "state", "o": "observation"}
-_MOST_BELIEFS, _MOST_SECONDS = 200_000, 60.0
+_MOST_SECONDS = 60.0  # for the beliefs
 _RESERVED = {*_LISTS, *_AXES, "discount", "values", "start"}
 
 
@@ -235,7 +235,7 @@ def _of_beliefs(where: str, model: _Text, actions: list[str]) -> Mdp:
     }
     begins = np.full(size, 1 / size) if model.start is None else model.start
     starts = [(chance, state, b"") for state, chance in _exact(begins[None, None])[0][0]]
-    beliefs = Beliefs(starts, steps, refusal, _MOST_BELIEFS, _MOST_SECONDS)
+    beliefs = Beliefs(starts, steps, refusal, _MOST_SECONDS)
     is_end = [over.issuperset(state for state, _ in node.belief) for node in beliefs.nodes]
     for node in beliefs.nodes:
         for action, row in enumerate(node.rows):

@@ -88,6 +88,31 @@ def test_a_wrapper_that_counts_is_a_step_limit() -> None:
     assert gridworld.compile_env(Counting(Windy(LIMITS["at least"]))).max_episode_steps == 25
 
 
+class Warmed(gym.Wrapper[Any, Any, Any, Any]):
+    """Takes two steps in each reset, which a time limit below it counts."""
+
+    def reset(self, **given: Any) -> Any:
+        shown, info = super().reset(**given)
+        for _ in range(2):
+            shown, *_ = self.env.step(3)
+        return shown, info
+
+
+class Hurried(gym.RewardWrapper[Any, Any]):
+    """Pays for the last step in time, by the count of the time limit below it."""
+
+    def reward(self, reward: Any) -> float:
+        return float(reward) - (self.get_wrapper_attr("_elapsed_steps") >= 4)
+
+
+def test_a_time_limit_counts_what_it_sees_and_may_be_read() -> None:
+    inside = Warmed(wrappers.TimeLimit(Windy(), 20))
+    assert gridworld.compile_env(inside).max_episode_steps == 18
+    assert gridworld.compile_env(wrappers.TimeLimit(Warmed(Windy()), 20)).max_episode_steps == 20
+    hurried = Hurried(wrappers.TimeLimit(Windy(), 4))
+    played(hurried, gridworld.compile_env(hurried))
+
+
 def worst(env: Windy) -> float:
     """What the last step in time pays less."""
     return -1.0 if env.steps >= env.most else 0.0
