@@ -13,6 +13,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
@@ -98,24 +99,17 @@ def folded(text: str) -> str:
 
     Command lines, which are to be copied, stay whole.
     """
-    width = min(shutil.get_terminal_size((_WIDEST, 0)).columns, _WIDEST) - 2
-    lines, shown = list[str](), list[str]()
-    for line in as_called(text).splitlines():
-        if lines and line[:1].strip() and lines[-1][:1].strip():  # of one paragraph
-            lines[-1] += f" {line}"
-        else:
-            lines.append(line)
-    for line in lines:
-        name, gap, meaning = re.fullmatch(r"( *(?:\S.*?(?=  |$))?)( *)(.*)", line).groups()  # type: ignore[union-attr]
+    width, shown = min(shutil.get_terminal_size((_WIDEST, 0)).columns, _WIDEST) - 2, list[str]()
+    fill = partial(textwrap.fill, width=width, break_long_words=False, break_on_hyphens=False)
+    for line in re.sub(r"(?m)^(\S.*)\n(?=\S)", r"\1 ", as_called(text)).splitlines():
+        name, gap, meaning = re.findall(r"( *(?:\S.*?(?=  |$))?)( *)(.*)", line)[0]
         hang = len(name + gap) if meaning else len(line) - len(line.lstrip())
-        if hang > width / 2:
-            shown.append(name)
-            line, hang = f"{'':8}{meaning}", 8
-        is_command = re.match(rf" +({CONSOLE}|python) ", line)
-        unbroken: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
-        shown.append(
-            line if is_command else textwrap.fill(line, width, subsequent_indent=" " * hang, **unbroken)
-        )
+        if re.match(rf" +({CONSOLE}|python) ", line):
+            shown.append(line)
+        elif hang > width / 2:
+            shown += [name, fill(meaning, initial_indent=" " * 8, subsequent_indent=" " * 8)]
+        else:
+            shown.append(fill(line, subsequent_indent=" " * hang))
     return "\n".join(shown)
 
 

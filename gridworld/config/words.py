@@ -67,6 +67,8 @@ def prepared(words: Sequence[str], of_many: bool = False) -> list[str]:
         name = key.lstrip("+")
         if key[:1] == "~" and key[1:] in settings_of_a_run():
             raise InputError(f"{word}: a setting cannot be taken away; give it a value, {key[1:]}=...")
+        if key == "env.id" and not chosen & {"env", "experiment"}:
+            found.append("env=gymnasium")
         if key == "env" and all(map(is_id, value.split(","))):
             found += ["env=gymnasium", f"env.id={value}"]
         elif name == "experiment" and value in pairs():
@@ -129,10 +131,11 @@ def refuse_unclear(words: Sequence[str]) -> None:
         if word[:1] in ("'", '"'):
             raise InputError(f"{word}: is in quotation marks, which the shell passed on; leave them out")
         if "=" not in word and not word.startswith("~"):
-            files = [conf_folder() / group / f"{word}.yaml" for group in groups if word]
-            right = "write --help" if word == "help" else "a setting is written key=value, as in agent=dqn"
-            right = next((f"write {file.parent.name}={word}" for file in files if file.is_file()), right)
-            raise InputError(f"{word or 'an empty word'}: is not a setting; {right}")
+            files = [conf_folder() / group / f"{word}.yaml" for group in groups]
+            choices = [f"write {file.parent.name}={word}" for file in files if word and file.is_file()]
+            choices += [f"write env={word}"] if is_id(word) else ["write --help"] if word == "help" else []
+            choices += ["a setting is written key=value, as in agent=dqn"]
+            raise InputError(f"{word or 'an empty word'}: is not a setting; {choices[0]}")
 
 
 def _refuse_options(words: Sequence[str]) -> None:

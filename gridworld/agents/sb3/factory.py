@@ -90,12 +90,6 @@ def algorithm_and_arguments(
     }
 
 
-def algorithm_class(where: str, path: Any) -> type[BaseAlgorithm]:
-    """Import a class of SB3's kind; see `import_class`."""
-    algorithm: type[BaseAlgorithm] = import_class(where, path, BaseAlgorithm)
-    return algorithm
-
-
 def import_class(where: str, path: Any, kind: type) -> Any:
     """Import a class that is derived from `kind`; `where` is the setting that has its path, for messages."""
     where = f"{where}={path}"
