@@ -14,7 +14,7 @@ from helpers.support import CONF, DEEP, configure
 
 import gridworld
 from gridworld.base.errors import InputError
-from gridworld.config.settings import agent_schemas, read_config
+from gridworld.config.settings import agent_schemas, foreign, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.words import prepared, refuse_unclear
 from gridworld.config.worlds import SOURCES
@@ -104,7 +104,7 @@ def test_a_manifest_reads_back_the_very_settings(overrides: list[str]) -> None:
         (("seed",), True, "config.seed=True: must be int"),
         (("env", "slip"), None, "config.env.slip=None: must be float"),
         (("agent", "algorithm"), "q_learning", "config.agent: has an unknown key batch_size"),
-        (("agent", "algorithm"), "os.system", "config.agent.algorithm='os.system' is unknown"),
+        (("agent", "algorithm"), 3, "config.agent.algorithm=3: must be str"),
         (("agent", "surprise"), 1, "config.agent: has an unknown key surprise"),
         (("agent",), [], "config.agent.algorithm=None is unknown"),
         (("evaluation",), 3, "config.evaluation: must be a mapping, is 3"),
@@ -121,6 +121,20 @@ def test_a_strangers_manifest_is_checked_field_by_field(
     with pytest.raises(InputError) as mistake:
         read_config(content, "manifest.json")
     assert words in str(mistake.value)
+
+
+@pytest.mark.parametrize("path", ["os.system", "evil:Mark", "evil.py:Mark"])
+def test_a_strangers_class_in_place_of_a_known_one_needs_trust(path: str) -> None:
+    """It is read with the settings of the class that it may be derived from; a table has no such class."""
+    for agent in ("dqn", "ppo", "a2c"):
+        content = dataclasses.asdict(configure(f"agent={agent}"))
+        content["agent"]["algorithm"] = path
+        assert read_config(content, "manifest.json").agent.algorithm == path
+        assert [name for name, *_ in foreign(content)] == ["agent.algorithm"]
+    content = dataclasses.asdict(configure("agent=sarsa"))
+    content["agent"]["algorithm"] = path
+    with pytest.raises(InputError, match="is unknown"):
+        read_config(content, "manifest.json")
 
 
 @pytest.mark.parametrize("setting", ["recording.visits", "logging.tensorboard", "recording", "checkpoint"])
