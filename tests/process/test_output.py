@@ -5,6 +5,7 @@ But where there was no room for what it prints, it fails at its end.
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -78,7 +79,8 @@ def test_progress_on_a_narrow_terminal_keeps_the_time_left_and_the_regret(
     progress.update(1_000, "regret 0.542, goal 50%")
     assert capsys.readouterr().err == "\rstep 1,000 of 200,000 (0%), regret 0.542, goal 50%"
     progress.update(2_000, "regret 0.542, goal 50%, certified optimal")
-    assert capsys.readouterr().err.rstrip() == "\rstep 2,000 of 200,000 (1%), about 0 s left, regret 0.542"
+    shown = re.sub(r"about \d+ s", "about N s", capsys.readouterr().err.rstrip())
+    assert shown == "\rstep 2,000 of 200,000 (1%), about N s left, regret 0.542"
 
 
 READ = """
