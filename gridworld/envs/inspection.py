@@ -27,12 +27,12 @@ from gridworld.envs.observations import KINDS, ObservationTable, TableObservatio
 from gridworld.envs.rendering import frame_size
 from gridworld.world.door import known
 from gridworld.world.door.attributes import layers_of
-from gridworld.world.door.world import Found, traits
+from gridworld.world.door.world import Found, enumerated, traits
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import Layout, load
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import verified
-from gridworld.world.sources.environment import as_environment, found_by, found_of, shortcut, step_limit
+from gridworld.world.sources.environment import as_environment, found_by, shortcut, step_limit
 
 # What a batch is, by the class whose methods it runs.
 _GYMNASIUM, _SB3 = "gymnasium.wrappers.vector", "stable_baselines3.common.vec_env"
@@ -140,7 +140,7 @@ def _made(make: Any, **bounds: Any) -> Task:
 
 
 def _single(env: gym.Env[Any, Any], **bounds: Any) -> Task:
-    return _known(env, **bounds) or _task_of_found(found_of(env, **bounds))
+    return _known(env, **bounds) or _task_of_found(enumerated("env", env, **bounds))
 
 
 def _known(

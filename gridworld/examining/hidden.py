@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable
-from fractions import Fraction
 from itertools import combinations, islice
 from typing import Any
 
@@ -20,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from gridworld.examining.seen import Seen
 from gridworld.world.door.attributes import differing, held_by, is_plain
+from gridworld.world.door.beliefs import summed
 from gridworld.world.door.counters import counted
 from gridworld.world.door.search import Search, State
 from gridworld.world.mdp import BoolArray, IntArray
@@ -133,10 +133,10 @@ def _outcomes_in(state: State) -> tuple[frozenset[Any], ...]:
     """How likely each action is followed by what; of an end only if it pays, for sooner may be better."""
     outcomes = []
     for row in state.steps:
-        shares: dict[Any, Fraction] = {}
-        for share, _, seen, reward, over, _ in row:
-            key = seen, np.sign(reward) if over else round(reward, 9), over
-            shares[key] = shares.get(key, Fraction(0)) + share
+        shares = summed(
+            ((seen, np.sign(reward) if over else round(reward, 9), over), share)
+            for share, _, seen, reward, over, _ in row
+        )
         outcomes.append(frozenset(shares.items()))
     return tuple(outcomes)
 

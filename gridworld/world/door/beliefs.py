@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -24,15 +24,16 @@ from gridworld.base.errors import InputError
 from gridworld.world.mdp import IntArray
 from gridworld.world.outcomes import Outcomes, check_size
 
+Number = TypeVar("Number", float, Fraction)
 Belief = tuple[tuple[int, Fraction], ...]  # hidden states, ascending, with their probabilities
 _MOST_NODES = 200_000
 _MOST_PARTS = 2_000_000  # hidden states of all beliefs together
 _MOST_BITS = 4_096  # bits of a probability, which a history without end makes longer and longer
 
 
-def summed(parts: Iterable[tuple[Any, Fraction]]) -> dict[Any, Fraction]:
+def summed(parts: Iterable[tuple[Any, Number]]) -> dict[Any, Number]:
     """The sum of what belongs to each key."""
-    sums: dict[Any, Fraction] = {}
+    sums: dict[Any, Number] = {}
     for key, part in parts:
         sums[key] = sums[key] + part if key in sums else part
     return sums

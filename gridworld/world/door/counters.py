@@ -226,7 +226,7 @@ def _only_cuts(search: Search, state: State, steps: list[list[Step]], limit: Cou
     return True
 
 
-def step_limit(search: Search) -> tuple[int | None, bool]:
+def limit_of(search: Search) -> tuple[int | None, bool]:
     """The step limit of what a search found, and whether something else truncates too, by the state."""
     known = [each for each in (counted(search), search.limit_met) if each is not None]
     cut = {state.depth + 1 for state, step in _steps(search) if step.truncated}

@@ -31,7 +31,7 @@ from gridworld.world.door.attributes import GENERATORS, attributes
 from gridworld.world.door.beliefs import Beliefs, Node, Step
 from gridworld.world.door.budget import MOST_STATES
 from gridworld.world.door.checks import walk
-from gridworld.world.door.counters import step_limit
+from gridworld.world.door.counters import limit_of
 from gridworld.world.door.known import Named
 from gridworld.world.door.layers import KEPT, Env, Layers
 from gridworld.world.door.rejection import Rejecting
@@ -61,13 +61,14 @@ class Found:
 def enumerated(where: str, env: Env, *, name: str = "", **bounds: Any) -> Found:
     """Find the world of an environment, wrappers included, which is left as it was.
 
-    Without a name it is called by its class; `where` and `bounds`: see `Search`. Raises InputError where it
-    has no such world, or none within these bounds.
+    Without a name it is called by its id or its class; `where` and `bounds`: see `Search`. Raises InputError
+    where it has no such world, or none within these bounds.
     """
     search = Search(where, env, **bounds)
     try:
         search.explore()
-        return _World(search, name or type(env.unwrapped).__name__).found
+        called = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+        return _World(search, name or called).found
     finally:
         search.budget.clear()
 
@@ -83,7 +84,7 @@ class _World:
             members.setdefault(number, []).append(state)
         self.members = [*(members[number] for number in range(len(members))), []]
         classes.append(len(members))  # what is over, as the last
-        limit, self._cuts_end = step_limit(search)
+        limit, self._cuts_end = limit_of(search)
         of_classes = partial(_in_classes, classes=classes, cuts_end=self._cuts_end)
         first = [[list(map(of_classes, row)) for row in found[0].steps] for found in self.members[:-1]]
         starts = [(each.probability, classes[each.following], each.seen) for each in search.resets.starts]

@@ -10,7 +10,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ import numpy as np
 
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import called_from, users_folder
+from gridworld.world.door.beliefs import summed
 from gridworld.world.mdp import ELSEWHERE, Mdp, leaves_of
 from gridworld.world.sources.environment import compile_id
 
@@ -90,22 +91,21 @@ def content_digest(mdp: Mdp) -> str:
             state: _hash(labels[state], *(_row(mdp, labels, state, a) for a in range(mdp.num_actions)))
             for state in states
         }
-    starts: dict[bytes, float] = {}
-    for state in mdp.start_states.tolist():
-        starts[labels[state]] = starts.get(labels[state], 0.0) + float(mdp.start[state])
-    shares = sorted((label, round(share, 12)) for label, share in starts.items())
-    return _hash(sorted(labels.values()), shares).hex()
+    starts = _shares((labels[state], mdp.start[state]) for state in mdp.start_states.tolist())
+    return _hash(sorted(labels.values()), starts).hex()
 
 
 def _row(mdp: Mdp, labels: Mapping[int, bytes], state: int, action: int) -> list[Any]:
-    shares: dict[Any, float] = {}
-    for following, chance, paid in zip(
-        mdp.next_state[state, action], mdp.probability[state, action], mdp.reward[state, action], strict=True
-    ):
-        if chance > 0:
-            key = labels[following], float(paid)
-            shares[key] = shares.get(key, 0.0) + float(chance)
-    return sorted((key, round(share, 12)) for key, share in shares.items())
+    outcomes = (table[state, action] for table in (mdp.next_state, mdp.probability, mdp.reward))
+    return _shares(
+        ((labels[following], float(paid)), chance)
+        for following, chance, paid in zip(*outcomes, strict=True)
+        if chance > 0
+    )
+
+
+def _shares(parts: Iterable[tuple[Any, float]]) -> list[Any]:
+    return sorted((key, round(float(share), 12)) for key, share in summed(parts).items())
 
 
 def _hash(*parts: Any) -> bytes:

@@ -71,28 +71,17 @@ def shortcut(env: gym.Env[Any, Any], name: str | None = None) -> Mdp | None:
     return compile_table(real, step_limit(env), name)
 
 
-def found_of(
-    env: gym.Env[Any, Any],
-    where: str = "env",
-    name: str = "",
-    **bounds: Any,
-) -> Found:
-    """What trying every action finds of an environment, wrappers included; `bounds`: see `enumerated`."""
-    called = name or (env.spec.id if env.spec is not None else type(env.unwrapped).__name__)
-    return enumerated(where, env, name=called, **bounds)
-
-
 def found_by(make: Callable[[], Env], where: str = "env", name: str = "", **bounds: Any) -> Found:
-    """The same of what a function makes, which must be the same world each time."""
+    """What trying every action finds of what a function makes, which must be the same world each time."""
     before = random_states()
     with closing(make()) as env:
         is_drawn = random_states() != before or _has_drawn(env)
-        found, own = found_of(env, where, name, **bounds), traits(env)
+        found, own = enumerated(where, env, name=name, **bounds), traits(env)
     for _ in range(_IF_DRAWN if is_drawn else _OTHERS):
         with closing(make()) as again:
             if traits(again) == own:
                 continue
-            other = found_of(again, where, name, **bounds)
+            other = enumerated(where, again, name=name, **bounds)
             if other.mdp.shown_digest() != found.mdp.shown_digest():
                 raise InputError(
                     f"{where}: is another world each time it is made, so it cannot be solved exactly; "
