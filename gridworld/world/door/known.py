@@ -210,11 +210,17 @@ def clock_watched() -> Iterator[set[str]]:
 
 
 class _Sums(dict[str, Any]):
-    def __missing__(self, key: str) -> None:
+    """Stands for what a recording says of an episode: that it is over may be seen, and nothing else."""
+
+    def _refuse(self, *_: Any) -> None:
         raise InputError(
             "env: a wrapper reads info['episode'] of a recording below it, which is left out; let it sum up "
             "what it needs itself"
         )
+
+
+for _name in ("__missing__", "__len__", "__iter__", "__contains__", "get", "items", "keys", "values"):
+    setattr(_Sums, _name, _Sums._refuse)
 
 
 class Recorded(gym.Wrapper[Any, Any, Any, Any]):

@@ -212,7 +212,8 @@ class Layers:
             {
                 name: value
                 for name, value in attributes(layer).items()
-                if (number, name) not in changing and (self._is_one(value) or len(self.dump(value)) > most)
+                if (number, name) not in changing
+                and (type(value) in ATOMS or id(value) in self.fixed or len(self.dump(value)) > most)
             }
             for number, layer in enumerate(self.layers)
         ]
@@ -223,10 +224,6 @@ class Layers:
         # One object stays one, wherever it is held.
         self._known = self.fixed | {id(each): each for each in recorder.met}
         self._shares = any(type(each) in _PLAIN for each in recorder.met)
-
-    def _is_one(self, value: Any) -> bool:
-        """Whether a value cannot change but by another in its place."""
-        return type(value) in ATOMS or id(value) in self.fixed
 
     def _content_left(self) -> bytes:
         return self.dump(self._left, self.fixed)

@@ -514,6 +514,30 @@ class Sparse(gym.Wrapper[Any, Any, Any, Any]):
         return observation, float(info["episode"]["r"]) if "episode" in info else 0.0, *over, info
 
 
+class Noticing(gym.Wrapper[Any, Any, Any, Any]):
+    """Pays by what a recording below it says, as `reads` has it."""
+
+    def __init__(self, env: Any, reads: Callable[[dict[str, Any]], Any]) -> None:
+        super().__init__(env)
+        self.reads = reads
+
+    def step(self, action: Any) -> Any:
+        observation, reward, *over, info = self.env.step(action)
+        return observation, float(reward) + float(self.reads(info)), *over, info
+
+
+def test_that_a_recording_ends_may_be_seen_and_no_more() -> None:
+    seen = Noticing(Monitor(Line()), lambda info: "episode" in info)
+    assert optimum(seen) == pytest.approx(2 * GAMMA**2, abs=1e-12)
+    for reads in (
+        lambda info: info.get("episode", {}).get("r", 0.0),
+        lambda info: bool(info.get("episode")),
+        lambda info: len(list(info.get("episode", []))),
+    ):
+        with pytest.raises(InputError, match=r"reads info\['episode'\] of a recording"):
+            gridworld.compile_env(Noticing(Monitor(Line()), reads))
+
+
 class IntOnly(Line):
     def step(self, action: int) -> Result:
         return super().step(1 if type(action) is int and action else 0)
