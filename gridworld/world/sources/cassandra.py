@@ -19,7 +19,7 @@ from typing import NoReturn
 import numpy as np
 
 from gridworld.base.errors import InputError
-from gridworld.world.door.beliefs import Belief, Beliefs, Step
+from gridworld.world.door.beliefs import Belief, Beliefs, Step, summed
 from gridworld.world.mdp import EXACT, FloatArray, Mdp
 from gridworld.world.outcomes import MOST_STATES, check_size, checked_text, mdp_from_outcomes, verified
 from gridworld.world.sources.files import ROUNDING, normal, outcomes_of_matrices
@@ -213,20 +213,17 @@ def _of_beliefs(where: str, model: _Text, actions: list[str]) -> Mdp:
 
     leads_to, shows = (_exact(model.tables[key]) for key in ("T", "O"))
     paid, size = model.tables["R"], len(model.names["state"])
-    steps: list[list[list[Step]]] = []
-    expected: list[list[dict[bytes, Fraction]]] = []  # of each hidden state and action, by what is shown
-    for state in range(size):
-        steps.append([])
-        expected.append([])
-        for action in range(len(actions)):
-            row, pays = [], dict[bytes, Fraction]()
-            for following, chance in leads_to[action][state]:
-                for shown, share in shows[action][following]:
-                    seen, reward = b"%d" % shown, Fraction(str(paid[action, state, following, shown]))
-                    row.append(Step(chance * share, following, seen, 0.0, False, False))
-                    pays[seen] = pays.get(seen, Fraction(0)) + chance * share * reward
-            steps[-1].append(row)
-            expected[-1].append(pays)
+    steps: list[list[list[Step]]] = [[] for _ in range(size)]
+    expected: list[list[dict[bytes, Fraction]]] = [[] for _ in range(size)]  # by what is shown
+    for state, action in np.ndindex(size, len(actions)):
+        parts = [
+            (chance * share, following, shown)
+            for following, chance in leads_to[action][state]
+            for shown, share in shows[action][following]
+        ]
+        steps[state].append([Step(share, to, b"%d" % shown, 0.0, False, False) for share, to, shown in parts])
+        pays = ((b"%d" % o, share * Fraction(str(paid[action, state, to, o]))) for share, to, o in parts)
+        expected[state].append(summed(pays))
     over = {
         state
         for state in range(size)
