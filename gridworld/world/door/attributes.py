@@ -138,7 +138,7 @@ def kind_of(thing: Any) -> Any:
 
 def holders_of(kinds: Iterable[type]) -> list[Any]:
     """Classes, and the modules that they are of; without those of libraries."""
-    own = [each for each in kinds if not _is_library(each.__module__)]
+    own = [each for each in kinds if not is_library(each.__module__)]
     return [
         *own,
         *dict.fromkeys(sys.modules[each.__module__] for each in own if each.__module__ in sys.modules),
@@ -175,6 +175,7 @@ def shared_with(holders: Iterable[Any]) -> list[Any]:
     return list(found.values())
 
 
-def _is_library(name: str) -> bool:
+def is_library(name: str) -> bool:
+    """Whether a module, by its name, is Python's own or of a package that environments are made with."""
     root = name.partition(".")[0]
     return (root in sys.stdlib_module_names and root != "__main__") or root in _LIBRARIES

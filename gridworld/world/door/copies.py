@@ -7,13 +7,12 @@ import enum
 import functools
 import io
 import pickle
-import sys
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 
-from gridworld.world.door.attributes import attributes, kind_of, set_attributes
+from gridworld.world.door.attributes import attributes, is_library, kind_of, set_attributes
 from gridworld.world.door.uniform import Uniform
 
 if TYPE_CHECKING:
@@ -133,16 +132,6 @@ def _is_taken_apart(kind: Any) -> bool:
         return False
     if issubclass(kind, gym.Env):
         return True
-    root = kind.__module__.partition(".")[0]
-    if (
-        root in sys.stdlib_module_names
-        or root in ("numpy", "torch", "pygame")
-        or issubclass(kind, _CONTAINERS)
-    ):
-        return root == "__main__" and not issubclass(kind, _CONTAINERS) and _has_its_own_way(kind)
-    return _has_its_own_way(kind)
-
-
-def _has_its_own_way(kind: type) -> bool:
-    own = ("__getstate__", "__reduce__", "__reduce_ex__")
-    return any(getattr(kind, name, None) is not getattr(object, name, None) for name in own)
+    ways = ("__getstate__", "__reduce__", "__reduce_ex__")
+    has_its_own = any(getattr(kind, name, None) is not getattr(object, name, None) for name in ways)
+    return has_its_own and not (is_library(kind.__module__) or issubclass(kind, _CONTAINERS))

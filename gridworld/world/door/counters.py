@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import operator
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -229,24 +229,17 @@ def _only_cuts(search: Search, state: State, steps: list[list[Step]], limit: Cou
 def limit_of(search: Search) -> tuple[int | None, bool]:
     """The step limit of what a search found, and whether something else truncates too, by the state."""
     known = [each for each in (counted(search), search.limit_met) if each is not None]
-    cut = {state.depth + 1 for state, step in _steps(search) if step.truncated}
-    if cut:
-        on = {state.depth + 1 for state, step in _steps(search) if not step.truncated}
-        is_timed = all(
-            search.states[step.following].depth == state.depth + 1
-            for state, step in _steps(search)
-            if step.following >= 0
-        )
+    steps = [
+        (state.depth + 1, step)
+        for state in search.states
+        for row in state.steps
+        for step in row
+        if not step.terminated
+    ]
+    if cut := {at for at, step in steps if step.truncated}:
+        on = {at for at, step in steps if not step.truncated}
+        is_timed = all(search.states[s.following].depth == at for at, s in steps if s.following >= 0)
         if not is_timed or max(on, default=0) >= min(cut):  # a state must have one time
             return min(known, default=None), True
         known.append(min(cut))
     return min(known, default=None), False
-
-
-def _steps(search: Search) -> Iterator[tuple[State, Step]]:
-    """The steps that do not terminate an episode, with the states from which they are."""
-    for state in search.states:
-        for row in state.steps:
-            for step in row:
-                if not step.terminated:
-                    yield state, step
