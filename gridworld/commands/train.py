@@ -182,6 +182,7 @@ def _train(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
     check(config)
     config.agent.check(config)
     if config.logging.progress and not is_started(folder):  # at once, since torch takes seconds to import
+        _world(config.env)
         world, steps = config.env.name, config.total_timesteps
         tell(f"training {config.agent.name} on {world}, seed {config.seed}, for {steps:,} steps")
     from gridworld.run.console import Summary, train_and_tell

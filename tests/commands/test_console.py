@@ -46,6 +46,7 @@ def test_help_version_and_words_that_are_no_command(
         assert ended == code
         return capsys.readouterr()
 
+    monkeypatch.setenv("COLUMNS", "110")
     assert told("--version") == (f"gridworld {__version__}\n", "")
     for words in ((), ("--help",), ("-h",), ("help",)):
         out, errors = told(*words)

@@ -136,17 +136,6 @@ def test_an_offer_has_the_steps_that_it_trains_and_about_its_time(tmp_path: Path
     assert trained.summary["timesteps"] == 1024
 
 
-def test_a_policy_that_is_improved_a_few_times_only_is_named(tmp_path: Path) -> None:
-    """Four rollouts of 2,048 steps; a random walk finds the goal in fewer steps than one of them has."""
-    words = ["agent=ppo", "n_envs=16", "agent.n_steps=128", "agent.batch_size=64", "total_timesteps=8000"]
-    words += ["agent.learning_rate=3e-4", "agent.ent_coef=0"]
-    gridworld.train(*words, folder=tmp_path / "run", seed=0, progress=False)
-    found = gridworld.diagnose(tmp_path / "run")
-    assert found.cause == "slow"
-    assert "its policy was improved 4 times, once per 2,048 steps" in found.findings[0].why
-    assert found.findings[0].changes[0] == "agent.n_steps=16"
-
-
 def test_many_large_updates_are_not_called_too_few(tmp_path: Path) -> None:
     words = ["agent=ppo", "n_envs=16", "agent.n_steps=32", "agent.batch_size=64", "total_timesteps=10000"]
     gridworld.train(*words, "agent.learning_rate=0.03", folder=tmp_path / "run", seed=0, progress=False)

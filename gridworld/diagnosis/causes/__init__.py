@@ -15,7 +15,7 @@ CAUSES: tuple[Cause, ...] = (
     objective.hopeless_gamma, objective.other_optimum, objective.too_much_epsilon, objective.too_much_entropy,
     learning.scaled, network.forgets, learning.lost_again, learning.diverged, network.cannot_represent,
     exploration.never_random, learning.clipped, learning.hardly_moved, learning.overshot,
-    network.spoilt_policy, learning.rarely_improved,
+    network.spoilt_policy,
     exploration.not_tried, exploration.collapsed,
     objective.faint_gamma, network.spoilt,
     learning.not_there_yet, exploration.ended_early, learning.unsettled,

@@ -32,7 +32,6 @@ _EVENLY = "n_envs=256 exploring_starts=1 stratified_draws=true"  # what leaves l
 _GRADIENT = 1e-3  # what each weight's gradient should have without an optimiser that scales it
 _FEW_UPDATES = 500  # of a network: fewer are too few whatever its target or its rate
 _FAST = 4  # times the usual rate
-_FEW_ROLLOUTS = 10  # after each of which a policy is improved
 _REFRESHES = 2  # of the target network, for each step of the way to the goal
 
 
@@ -101,19 +100,6 @@ def hardly_moved(run: Evidence) -> Finding | None:
     late = run.setting("learning_starts") > run.config.total_timesteps / 2
     starts = (run.change("learning_starts", 100),) if late else ()
     return Finding("slow", run.split.wrong, why, (*starts, *faster(run)))
-
-
-def rarely_improved(run: Evidence) -> Finding | None:
-    """A policy that changes between rollouts only, of which there were few."""
-    rollouts = run.steps / run.rollout
-    if not run.is_actor_critic or rollouts >= _FEW_ROLLOUTS or _too_short(run, run.split.wrong):
-        return None
-    why = (
-        f"it was still learning: its policy was improved {rollouts:.0f} times, once per {run.rollout:,} steps"
-    )
-    shorter = max(2, run.setting("n_steps") // 8, run.setting("batch_size") // run.config.n_envs)
-    often = (run.change("n_steps", shorter),) if shorter < run.setting("n_steps") else ()
-    return Finding("slow", run.split.wrong, why, (*often, longer(run, 10)))
 
 
 def overshot(run: Evidence) -> Finding | None:
