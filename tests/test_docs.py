@@ -84,6 +84,7 @@ def unusual(text: str) -> dict[str, str]:
     return {turn: usual for turn, usual in TURNS.items() if re.search(rf"\b({turn})\b", text, re.IGNORECASE)}
 
 
+@pytest.mark.slow
 def test_pages_messages_and_help_use_the_usual_words() -> None:
     """All strings of the package with a space, except docstrings; a command's docstring is its help."""
     whole = [

@@ -186,6 +186,7 @@ def agrees(score: gridworld.Score, mean: float, error: float) -> bool:
     return abs(score.outcome.expected_return - mean) <= 5 * error + (0.03 if error else 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("world", "kind"),
     [
@@ -218,6 +219,7 @@ def test_the_score_of_a_table_is_what_it_earns_through_wrappers(world: str, kind
     assert gridworld.evaluate(best, mdp).certified
 
 
+@pytest.mark.slow
 def test_a_reward_by_running_statistics_is_refused() -> None:
     with pytest.raises(InputError, match=r"^env: .*(return_rms|discounted_reward|reset)"):
         gridworld.evaluate(BEST, wrappers.NormalizeReward(lake()))
@@ -404,6 +406,7 @@ def played_by(model: Any, env: Any) -> float:
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SEEN)
 def test_a_model_is_scored_by_what_it_is_shown(kind: str) -> None:
     env = SEEN[kind]()
@@ -518,6 +521,7 @@ def never_back(env: Any) -> Any:
     return ActionMasker(env, allowed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masking", [only_left, never_back])
 def test_a_model_with_masks_is_scored_with_them(masking: Any) -> None:
     for seed in range(6):

@@ -29,6 +29,7 @@ def timeless(summary: dict[str, object]) -> dict[str, object]:
     return {name: value for name, value in summary.items() if name not in TIMES}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("agent", ["dqn", "q_learning"])
 def test_bit_for_bit_what_the_command_does(agent: str, tmp_path: Path) -> None:
     words = [*SHORT[agent], "seed=3"]

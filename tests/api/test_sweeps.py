@@ -57,6 +57,7 @@ def test_what_a_sweep_shows(swept: gridworld.SweepResult, monkeypatch: pytest.Mo
     assert swept.table == swept.rows
 
 
+@pytest.mark.slow
 def test_a_sweeps_report(swept: gridworld.SweepResult, folder: Path) -> None:
     assert swept.report() == folder / "report" / "report.html"
     assert "sarsa" in (folder / "report" / "report.html").read_text()
@@ -123,6 +124,7 @@ def test_recordings(tmp_path: Path) -> None:
         gridworld.record(gridworld.train("agent=value_iteration", progress=False))
 
 
+@pytest.mark.slow
 def test_a_study(tmp_path: Path) -> None:
     few = {"trials": 2, "seeds": 1, "final_seeds": 1, "confirm_seeds": 2, "workers": 1}
     words = ("agent=q_learning", {"tune": few}, *SMALL)

@@ -315,6 +315,7 @@ def test_refused_tables(given: tuple[Any, ...], named: dict[str, Any], sentence:
     assert re.search(re.escape(sentence), refused(*given, **named))
 
 
+@pytest.mark.slow
 def test_refused_models() -> None:
     one_hot = gridworld.OneHotObservation(gym.make(RAW))
     model = PPO("MlpPolicy", one_hot, n_steps=64)

@@ -37,6 +37,7 @@ def once(kind: object, name: str) -> tuple[bool | None, str]:
     return run._once(subject(kind), {}, 0, [BY_NAME[name]])[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(bugs.CAUGHT) if PLANT_ALL else FEW, ids=lambda kind: kind.__name__)
 def test_a_planted_bug_fails_its_probe(kind: type) -> None:
     for name in bugs.CAUGHT[kind] if PLANT_ALL else bugs.CAUGHT[kind][:1]:
@@ -44,6 +45,7 @@ def test_a_planted_bug_fails_its_probe(kind: type) -> None:
         assert passed is False, (name, found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "name", "expected"),
     [
@@ -157,6 +159,7 @@ def test_what_a_class_refuses_is_the_users_mistake() -> None:
         gridworld.check("sb3_contrib.RecurrentPPO", probes=["choice"])
 
 
+@pytest.mark.slow
 def test_worlds_of_ones_own_are_probes_too(capsys: pytest.CaptureFixture[str]) -> None:
     lake = gridworld.compile_env("FrozenLake-v1")
     result = gridworld.check("q_learning", probes=["choice"], worlds=["classic", lake], steps=100_000)

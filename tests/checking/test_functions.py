@@ -151,6 +151,7 @@ CAUGHT = {
 STEPS = {"dqn": 2000, "ppo": 3000}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", STEPS)
 def test_cleanrls_learners_pass(kind: str) -> None:
     torch.set_num_threads(1)
@@ -161,6 +162,7 @@ def test_cleanrls_learners_pass(kind: str) -> None:
     assert PLANT_ALL or all(finding.passed for finding in result.findings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "bug"), CAUGHT)
 def test_a_bug_in_them_is_found(kind: str, bug: str) -> None:
     torch.set_num_threads(1)
@@ -196,6 +198,7 @@ def q_learning(env: Any, steps: int, seed: int, gamma: float, bug: str) -> np.nd
     return q
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bug", "failed"),
     [
@@ -217,6 +220,7 @@ def test_values_below_0_and_rewards_beyond_1(bug: str, failed: list[str]) -> Non
     assert set(failed) <= set(result.failed), str(result)
 
 
+@pytest.mark.slow
 def test_a_bug_is_blamed_once() -> None:
     result = gridworld.check(
         lambda env, steps, seed, gamma: {"q": q_learning(env, steps, seed, gamma, "limits")},
@@ -247,6 +251,7 @@ def test_a_function_in_a_file_is_found_by_other_processes_too(
     assert [each.name for each in result.findings] == ["choice", "delay"]
 
 
+@pytest.mark.slow
 def test_what_fails_in_one_step_is_mended_first() -> None:
     result = gridworld.check(
         lambda env, steps, seed, gamma: {"q": q_learning(env, steps, seed, gamma, "double")},

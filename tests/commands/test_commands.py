@@ -41,6 +41,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
+@pytest.mark.slow
 def test_train_tells_what_was_reached_and_where(finished: Path) -> None:
     output = (finished.parent / "output.txt").read_text()
     summary = json.loads((finished / "summary.json").read_text())
@@ -89,6 +90,7 @@ def test_asking_imports_nothing_heavy(command: str, tmp_path: Path) -> None:
     assert ("numpy" in modules) <= ("--cfg" in command)
 
 
+@pytest.mark.slow
 def test_evaluate_scores_again_exactly_and_by_sampling(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -172,6 +174,7 @@ def test_a_job_in_its_own_folder_speaks_of_the_users(tmp_path: Path) -> None:
     assert f"python {ROOT}/scripts/train.py resume=runs/own total_timesteps=" in again.stderr
 
 
+@pytest.mark.slow
 def test_tune_shows_what_train_would_run(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     words = ["agent=q_learning", "total_timesteps=1e3", "tune.trials=1e1"]
 

@@ -155,6 +155,7 @@ def test_the_wheel_holds_what_it_takes_to_train(wheel: Path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_it_trains_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
     site, here = tmp_path / "site", tmp_path / "here"
     here.mkdir()

@@ -74,6 +74,7 @@ def test_the_first_are_of_the_catalogue() -> None:
     assert len(CATALOGUE) >= 50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_nothing_of_a_hostile_run_gets_out(case: Hostile, good: Path, tmp_path: Path) -> None:
     base = tmp_path / "base"

@@ -100,6 +100,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
             del sys.modules[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "states", "limit"),
     [
@@ -121,6 +122,7 @@ def test_a_name_is_enough(words: list[str], states: int | None, limit: int | Non
     assert (mdp.num_states, env.step_limit(mdp)) == (states, limit)
 
 
+@pytest.mark.slow
 def test_a_file_may_have_the_name_of_another_module(here: Path) -> None:
     for name in ("gridworld.py", "json.py", "test.py"):
         (here / name).write_text(MODULE)
@@ -140,6 +142,7 @@ def test_bounds_and_the_users_word(here: Path) -> None:
         gridworld.compile_env("classic", ignore=["moves"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "agent", "kind"), [("Goals", "dqn", DQN), ("Corridor", "a2c", A2C), ("Pixels", "dqn", DQN)]
 )
@@ -166,6 +169,7 @@ def test_a_model_fits_the_environment_that_it_was_trained_on(
     model.learn(64)
 
 
+@pytest.mark.slow
 def test_a_run_on_a_dict_goes_on_as_if_it_had_not_stopped(here: Path) -> None:
     words = ("agent=dqn", "env=goals:Goals", "observation=own", "checkpoint.every=300", *SHORT)
     assert script("train.py", *words, "hydra.run.dir=whole", cwd=here).returncode == 0
@@ -178,6 +182,7 @@ def test_a_run_on_a_dict_goes_on_as_if_it_had_not_stopped(here: Path) -> None:
     assert all(np.array_equal(weights[0][key], weights[1][key]) for key in weights[0])
 
 
+@pytest.mark.slow
 def test_a_run_of_somebody_elses_is_opened_without_its_module(here: Path) -> None:
     """The current folder is searched for names that were typed, never for those of a run."""
     words = ("agent=q_learning", "env=goals:Goals", "hydra.run.dir=run", *SHORT)
@@ -194,6 +199,7 @@ def test_a_run_of_somebody_elses_is_opened_without_its_module(here: Path) -> Non
         assert not (here / "was_imported").exists(), command
 
 
+@pytest.mark.slow
 def test_a_sweep_over_environments(here: Path) -> None:
     words = ("-m", "agent=q_learning", "env=goals:Goals,goals:Corridor", "hydra.sweep.dir=swept", *SHORT)
     done = script("train.py", *words, cwd=here)

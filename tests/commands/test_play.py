@@ -138,6 +138,7 @@ def test_taxi_is_played_with_arrows_and_digits(real: bool) -> None:
     assert first.shape == before.shape
 
 
+@pytest.mark.slow
 def test_minigrid_is_played_in_its_own_pictures_and_its_time_is_limited() -> None:
     env = EnumeratedConfig(id="MiniGrid-Empty-5x5-v0", kwargs={"max_steps": 7})
     mdp = env.compile()

@@ -54,6 +54,7 @@ def worlds(folder: Path) -> set[tuple[str, float]]:
     return {("\n".join(each["layout"]), each["config"]["env"]["slip"]) for each in manifests}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [[LAYOUT], ["--config-dir", "my conf", "env=icy"]])
 def test_what_train_and_diagnose_print(words: list[str], home: Path, tmp_path: Path) -> None:
     done = called(["train", *words, *SPOILT, *NO_FILES, "hydra.run.dir=runs/a run"], home)
@@ -91,6 +92,7 @@ def test_an_unfinished_run_is_resumed_from_another_folder(home: Path, tmp_path: 
     assert json.loads(manifest.read_text())["status"] == "finished"
 
 
+@pytest.mark.slow
 def test_what_a_sweep_and_a_study_print(home: Path) -> None:
     own = ["--config-dir", "my conf", "env=icy", *SPOILT, *NO_FILES]
     done = called(["train", "-m", *own, "seed=0,1", "hydra.sweep.dir=runs/a sweep"], home)

@@ -149,6 +149,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("agent", "source"), CASES)
 def test_no_door_runs_what_a_stranger_names(agent: str, source: str | None, good: Path, mark: Path) -> None:
     run, like = mark.parent / "run", good / agent
@@ -182,6 +183,7 @@ def test_with_trust_the_mark_is_left(good: Path, mark: Path) -> None:
     assert mark.exists()
 
 
+@pytest.mark.slow
 def test_no_recipe_runs_what_a_stranger_names(mark: Path) -> None:
     path = mark.parent / "winner.yaml"
     for name in settings.settings_of_a_run():

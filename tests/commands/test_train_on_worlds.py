@@ -34,6 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_run_keeps_its_world(folder: Path) -> None:
     saved = SavedRun(folder / "short")
     made = compile_id("FrozenLake-v1", {"is_slippery": False})

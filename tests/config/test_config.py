@@ -35,6 +35,7 @@ COMPLETED = {  # choices that leave something to say
 FROM_ELSEWHERE = {"self", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_choice_composes_and_could_train(
     group: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -18,11 +18,13 @@ from gridworld.training.setup import check_settings, notes
 OF_CLASSES = sorted(file for name in ("stochastic", "large") for file in CONF.glob(f"tuned/*/{name}.yaml"))
 
 
+@pytest.mark.slow
 def test_one_rule_chooses() -> None:
     for words, recipe in table("config/cases.txt", "recipes by the rule"):
         assert configure(*words.split()).recipe == recipe, words
 
 
+@pytest.mark.slow
 def test_the_recipes_of_classes_pass_the_checks() -> None:
     for file in OF_CLASSES:
         agent, name = file.parent.name, f"{file.parent.name}/{file.stem}"
@@ -65,6 +67,7 @@ def test_words_of_earlier_versions() -> None:
             configure(*words)
 
 
+@pytest.mark.slow
 def test_the_world_is_known_before_a_recipe_is_chosen() -> None:
     """Whether its tables are read or searched for."""
     by_table, searched = (configure("agent=dqn", f"env={kind}", "env.id=FrozenLake-v1") for kind in SAME)
@@ -131,6 +134,7 @@ def test_a_recipe_is_chosen_alike_from_python_and_by_the_command(tmp_path: Path)
     assert "total_timesteps: 12800000" in shown
 
 
+@pytest.mark.slow
 def test_each_job_of_a_sweep_has_its_own_recipe_and_a_line_says_so(tmp_path: Path) -> None:
     words = ["agent=q_learning", "-m", "env.slip=0,0.1", "seed=1", f"hydra.sweep.dir={tmp_path}/s"]
     done = script("train.py", *words, *NO_FILES[:-1], cwd=tmp_path)
@@ -201,6 +205,7 @@ def test_a_small_stochastic_world_is_certified(tmp_path: Path) -> None:
     assert summary["privileges"] == ["starts anywhere", "stratified draws"]
 
 
+@pytest.mark.slow
 def test_each_world_is_its_own_file_and_no_other() -> None:
     """Where settings of another kind of world are missing, too."""
     files = sorted(file.stem for file in CONF.glob("env/*.yaml"))

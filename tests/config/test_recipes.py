@@ -27,6 +27,7 @@ STUDIES = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))
 TRAINED = {agent: env for env, agent in RECIPES if env in ("aima_4x3", "four_rooms")}
 
 
+@pytest.mark.slow
 def test_an_agent_in_a_world_brings_its_recipe() -> None:
     assert {(env, agent) for env, agent in RECIPES} <= set(pairs().values())
     for env, agent in RECIPES:

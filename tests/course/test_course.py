@@ -108,6 +108,7 @@ def test_every_sheet_is_tried() -> None:
     assert [find_sheet(str(number)) for number in range(1, len(SHEETS) + 1)] == list(SHEETS.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sheet", SHEETS)
 def test_a_sheet_says_what_it_pays_and_has_no_answers(sheet: str) -> None:
     content = json.loads(SHEETS[sheet].read_text("utf-8"))
@@ -124,11 +125,13 @@ def test_a_sheet_says_what_it_pays_and_has_no_answers(sheet: str) -> None:
     assert any("is not done yet" in sentence for sentence in lost.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sheet", SHEETS)
 def test_the_solution_has_all_points(sheet: str) -> None:
     assert points_lost(sheet, COURSE / "solutions" / f"{sheet}.ipynb") == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sheet", [path.stem for path in (COURSE / "hidden").iterdir()])
 def test_students_check_themselves_without_the_hidden_part(sheet: str, tmp_path: Path) -> None:
     shutil.copytree(COURSE / "marking", tmp_path / "marking")
@@ -140,6 +143,7 @@ def test_students_check_themselves_without_the_hidden_part(sheet: str, tmp_path:
         assert list(points_lost(sheet, changed(sheet, old, new, tmp_path), tmp_path)) == lost.split()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sheet", "old", "new", "lost"), [(s, *row) for s in SHEETS for row in WRONG[s]])
 def test_a_wrong_answer_costs_its_own_points(
     sheet: str, old: str, new: str, lost: str, tmp_path: Path
@@ -147,6 +151,7 @@ def test_a_wrong_answer_costs_its_own_points(
     assert list(points_lost(sheet, changed(sheet, old, new, tmp_path))) == lost.split()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sheet", SHEETS)
 @pytest.mark.parametrize("value", ["'nan'", "float('nan')", "1j", "None"])
 def test_what_is_no_number_earns_no_points(sheet: str, value: str, tmp_path: Path) -> None:
@@ -157,6 +162,7 @@ def test_what_is_no_number_earns_no_points(sheet: str, value: str, tmp_path: Pat
     assert len(points_lost(sheet, tmp_path / "mine.ipynb")) == len(read_sheet(SHEETS[sheet]).exercises)
 
 
+@pytest.mark.slow
 def test_a_right_answer_may_look_different(tmp_path: Path) -> None:
     """Other types, Jupyter's `display`, and a seed with which SARSA learns a bad policy."""
     fractions = "display(1)\nfrom fractions import Fraction\nVALUES_RIGHT = (Fraction(81, 100), 0.9, 1)"

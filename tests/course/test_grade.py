@@ -109,6 +109,7 @@ def marked(folder: Path, *cells: str, seconds: int = 3) -> tuple[list[int], str,
     return [points for _, points, _ in rows], rows[0][2], notes
 
 
+@pytest.mark.slow
 def test_what_a_function_does_costs_its_own_points(tmp_path: Path) -> None:
     for body, words in HOSTILE.items():
         started = time.monotonic()

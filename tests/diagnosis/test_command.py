@@ -88,6 +88,7 @@ class Parts(Image):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env", "name"),
     [
@@ -172,6 +173,7 @@ def test_a_world_without_places_is_diagnosed_and_drawn_too() -> None:
     assert draw_diagnosis(found).ndim == 3
 
 
+@pytest.mark.slow
 def test_offers_are_tried_until_one_is_certified(tmp_path: Path, capsys) -> None:
     slow = ["agent=q_learning", "agent.learning_rate=0.001", "total_timesteps=20000"]
     gridworld.train(*slow, folder=tmp_path / "slow", seed=3, progress=False)

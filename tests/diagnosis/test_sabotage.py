@@ -40,6 +40,7 @@ def diagnosed(each: Sabotage, world: str, seed: int) -> Diagnosis:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
     "each",
@@ -134,6 +135,7 @@ OTHERS = {  # settings, the causes that name it, what the sentence or the comman
 # fmt: on
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", OTHERS)
 def test_what_else_is_told(what: str) -> None:
     words, causes, parts = OTHERS[what]
@@ -185,6 +187,7 @@ SPOILT = {  # what was done, and the offer that has to come first
 # fmt: on
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", SPOILT)
 def test_what_is_offered_first_is_certified(what: str) -> None:
     agent, word, causes, offer = SPOILT[what]

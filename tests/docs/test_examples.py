@@ -67,6 +67,7 @@ def test_a_section_of_rl_zoo_becomes_an_agent() -> None:
         zoo.converted("sac", section)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRINTED)
 def test_an_example(name: str, tmp_path: Path) -> None:
     done = script(str(EXAMPLES / name), *ARGUMENTS.get(name, []), cwd=tmp_path, OMP_NUM_THREADS="1")
@@ -87,6 +88,7 @@ def test_the_page_of_optimal_values_has_what_its_command_prints(name: str) -> No
     assert f"## {name}\n\n```text\n{policy}\n```\n" in page
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_the_notebook_shows_what_is_stored_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import nbformat

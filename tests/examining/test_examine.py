@@ -32,6 +32,7 @@ def test_a_sound_environment_has_no_findings(sound: Any) -> None:
     assert result.passed, str(result)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["FrozenLake-v1", "Taxi-v4", "Blackjack-v1", "CartPole-v1", "cliff", "river_swim"]
 )

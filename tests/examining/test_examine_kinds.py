@@ -540,6 +540,7 @@ class HiddenCellInTime(HiddenCellWithSlip):
 HIDDEN = [HiddenCell, HiddenCellAndADraw, HiddenCellWithSlip, HiddenCellInTime]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", HIDDEN)
 def test_a_hidden_goal_is_named_also_where_steps_draw(env: Any) -> None:
     result = examine(lambda: gym.wrappers.TimeLimit(env(), 50), steps=STEPS)

@@ -150,6 +150,7 @@ class OneStep1874(gym.Env[Any, Any]):
         return np.array([self.x, self.y]), reward, True, False, {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env", "causes"),
     [

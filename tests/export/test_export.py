@@ -68,6 +68,7 @@ def summary_of(place: Path) -> dict[str, Any]:
     return content
 
 
+@pytest.mark.slow
 def test_wandb(place: Path) -> None:
     *told, then = exported(place, "wandb", "runs/dqn", "runs/unfinished", "--project", "mine")
     assert then == "next: wandb sync runs/export/wandb/wandb/offline-run-*"
@@ -107,6 +108,7 @@ def test_wandb(place: Path) -> None:
     assert [entry.path for entry in artifact.manifest.contents] == ["best_model.zip", "model.zip"]
 
 
+@pytest.mark.slow
 def test_wandb_while_it_trains(tmp_path: Path) -> None:
     """Two runs that train together, and an agent of SB3's own loop with W&B's callback."""
     callback = "callbacks=[{_target_: wandb.integration.sb3.WandbCallback, verbose: 0}]"
@@ -177,6 +179,7 @@ def exported_and_read(place: Path, to: str, code: str, *words: str) -> tuple[lis
     return told[:3], json.loads(found)
 
 
+@pytest.mark.slow
 def test_mlflow(place: Path) -> None:
     read = """
         from mlflow import MlflowClient

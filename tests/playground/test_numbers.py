@@ -87,6 +87,7 @@ def settings_of(mdp: GridMdp, gamma: float) -> dict[str, float]:
     return {name: getattr(mdp, name) for name in names} | {"max_episode_steps": 100, "gamma": gamma}
 
 
+@pytest.mark.slow
 def test_values_optimal_actions_scores_and_regret(page: Callable[..., Any]) -> None:
     random, sent, evaluators, policies = np.random.default_rng(2), [], [], []
     for mdp, gamma in cases():

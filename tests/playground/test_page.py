@@ -253,6 +253,7 @@ act();
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["world.html", "map.html", "table.html"])
 def test_no_order_of_clicks_and_keys_is_an_error(name: str, page: Page) -> None:
     page(name=name).execute_async_script(MONKEY, 5)  # `page` looks at the browser's log

@@ -6,6 +6,7 @@ import signal
 from multiprocessing import forkserver
 from pathlib import Path
 
+import pytest
 from helpers.support import script
 
 PROBE = """
@@ -28,6 +29,7 @@ raise RuntimeError("on purpose")
 """
 
 
+@pytest.mark.slow
 def test_a_fork_starts_and_ends_as_a_process_of_its_own(tmp_path: Path) -> None:
     (tmp_path / "probe.py").write_text(PROBE)
     (tmp_path / "own").mkdir()

@@ -106,6 +106,7 @@ def test_a_verdict_is_coloured_on_a_terminal_alone(
     assert b"  certified optimal: " in shell(line, tmp_path, **variables).stdout
 
 
+@pytest.mark.slow
 def test_a_run_says_what_it_trains_before_torch_is_imported(tmp_path: Path) -> None:
     """Where torch cannot be imported, it is the line before the error; a refused setting has no such line."""
     (tmp_path / "torch.py").write_text("raise ImportError('slow')")
@@ -117,6 +118,7 @@ def test_a_run_says_what_it_trains_before_torch_is_imported(tmp_path: Path) -> N
         assert (b"slow" in said) == ("tau" not in more)
 
 
+@pytest.mark.slow
 def test_names_in_a_locale_without_utf8(tmp_path: Path) -> None:
     (tmp_path / "mäp.txt").write_text("S..\n..G\n")
     words = [*SHORT["q_learning"], "env.layout='mäp.txt'", "hydra.run.dir=run"]

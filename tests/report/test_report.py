@@ -256,6 +256,7 @@ def test_an_endless_walk_that_costs_infinitely_much_is_shown(tmp_path: Path) -> 
     assert ",inf," in (report_of(tmp_path) / "tables" / "results.csv").read_text()
 
 
+@pytest.mark.slow
 def test_agents_are_compared_on_each_task_and_on_those_that_they_share(study: Report) -> None:
     assert {len(group.runs) for group in study.study.groups} == {4, 5}
     of_tasks = {task.task: task.comparisons for task in study.tasks}
@@ -611,6 +612,7 @@ def test_figures_and_tables_are_files_too(written: Path) -> None:
     assert "| classic | dqn | 5 / 5 [57 %, 100 %] |" in (written / "tables" / "results.md").read_text()
 
 
+@pytest.mark.slow
 def test_the_same_runs_give_the_same_bytes(written: Path, study: Report) -> None:
     runs = written.parent
     before = {path: path.read_bytes() for path in (*written.glob("*.html"), *written.glob("tables/*"))}

@@ -36,6 +36,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return runs / "report" / "report.html"
 
 
+@pytest.mark.slow
 def test_a_browser_shows_it(page: Path, tmp_path: Path) -> None:
     with chromium(tmp_path / "profile") as browser:
         for scheme in ("light", "dark"):

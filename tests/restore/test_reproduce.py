@@ -66,6 +66,7 @@ def test_an_agent_comes_to_the_same_bits(
     assert sorted(path.stat().st_mtime_ns for path in (tmp_path / "run").iterdir()) == before
 
 
+@pytest.mark.slow
 def test_other_processes_and_hash_seeds_come_to_the_same_bits(tmp_path: Path) -> None:
     words = [*SHORT["ppo"], "hydra.run.dir=run", "env.layout=map.txt"]
     (tmp_path / "map.txt").write_text("S...\n.#T.\n...G\n")

@@ -79,6 +79,7 @@ CASES = {
 LESS = ["recording.frames=false", "recording.gif=false", "env.slip=0.1", "exploration_bonus=0.1"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_every_agent_goes_on_to_the_bit(case: str, tmp_path: Path) -> None:
     """After its process has died at the first checkpoint, and again some later."""
@@ -104,6 +105,7 @@ def members(path: Path) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [*CASES, "value_iteration"])
 def test_a_run_that_dies_after_its_last_checkpoint_writes_the_same_model(case: str, tmp_path: Path) -> None:
     """Whatever is in the file: the optimiser's rate, what is left of training, counters."""

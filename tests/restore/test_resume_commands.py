@@ -67,6 +67,7 @@ def manifest(folder: Path) -> dict[str, object]:
     return content
 
 
+@pytest.mark.slow
 def test_resume_and_the_same_command_again(stopped: Path, calm: dict[str, object]) -> None:
     shutil.copytree(stopped, stopped.with_name("other"))
     cwd = stopped.parent
@@ -307,6 +308,7 @@ call("train")
 """
 
 
+@pytest.mark.slow
 def test_a_signal_between_two_questions_of_a_safe_point_loses_nothing(tmp_path: Path) -> None:
     words = ("agent=a2c", "total_timesteps=10000", "evaluation.every=32", "hydra.run.dir=run")
     command = [sys.executable, "-c", STOPPED_BETWEEN, *words]

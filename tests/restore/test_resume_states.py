@@ -117,6 +117,7 @@ PLAIN = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("agent", RUNS)
 def test_what_is_left_out_is_missed(agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Item by item, with what a new run begins with in its place: the run ends otherwise, or is refused."""
@@ -147,6 +148,7 @@ def test_what_is_left_out_is_missed(agent: str, tmp_path: Path, monkeypatch: pyt
     assert [name for name in not_missed if name not in DERIVED] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("agent", ["ppo", "q_learning"])
 def test_what_is_taken_out_is_refused(agent: str, tmp_path: Path) -> None:
     """Item by item: there is no default that could hide a loss."""

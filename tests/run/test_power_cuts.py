@@ -104,6 +104,7 @@ def run_sweep(folder: Path) -> None:
         sweep.write(sweep.rows())
 
 
+@pytest.mark.slow
 def test_a_sweep_goes_on_after_a_power_cut(tmp_path: Path) -> None:
     run_sweep(tmp_path / "calm")
     calm = {name: left_behind(tmp_path / "calm" / name) for name in ("seed=0", "seed=1")}

@@ -77,6 +77,7 @@ def swept(two_jobs: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(two_jobs, tmp_path / "copy"))
 
 
+@pytest.mark.slow
 def test_a_sweep_is_come_back_to(swept: Path) -> None:
     folder = swept / "sweep"
     first = (folder / "seed=0" / "manifest.json").read_bytes()
@@ -107,6 +108,7 @@ def test_a_sweep_is_come_back_to(swept: Path) -> None:
     assert set(statuses(folder).values()) == {"done"}
 
 
+@pytest.mark.slow
 def test_settings_are_told_by_the_words_that_asked_for_them(tmp_path: Path) -> None:
     """Many others follow from the slip, and would hide it."""
     words = ("agent=ppo", "env.slip=0,0.1", "observation=one_hot,coordinates", "total_timesteps=300")
@@ -189,6 +191,7 @@ def curve_begun(path: Path) -> bool:
     return path.read_text().count("\n") > 2
 
 
+@pytest.mark.slow
 def test_a_fork_that_is_killed_takes_no_other_job_along(tmp_path: Path) -> None:
     words = ["-m", *QUICK, "seed=range(3)", "total_timesteps=20000", FOLDER, "hydra/launcher=forks"]
     with start("train.py", *words, "hydra.launcher.n_jobs=2", cwd=tmp_path) as process:
@@ -247,6 +250,7 @@ def test_a_job_that_cannot_go_on_says_why_and_begins_anew_if_asked(
     assert (folder / "mynotes.txt").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_told_and_the_same_line_goes_on(tmp_path: Path) -> None:
     """Too few bytes for the table, then for a job's event file."""
     words = ["-m", *QUICK, "seed=0,1", "total_timesteps=2000", "checkpoint.every=500", FOLDER]

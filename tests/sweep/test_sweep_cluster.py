@@ -55,6 +55,7 @@ def a_class(*names: str) -> list[str]:
     return [*short, f"agent.algorithm={','.join(names)}"]
 
 
+@pytest.mark.slow
 def test_a_small_sweep_comes_to_its_end_and_is_widened(cluster: Cluster, tmp_path: Path) -> None:
     """A failure and a lost process take no other job along."""
     two_per_task = ["hydra.launcher.jobs_per_task=2"] if cluster.launcher == "slurm" else []
@@ -82,6 +83,7 @@ def test_a_small_sweep_comes_to_its_end_and_is_widened(cluster: Cluster, tmp_pat
     assert "0 to run" in script("train.py", *here, cwd=tmp_path).stderr  # they are the same jobs
 
 
+@pytest.mark.slow
 def test_a_signal_gives_its_tasks_up(cluster: Cluster, tmp_path: Path) -> None:
     folder = tmp_path / "sweep"
     with cluster.start("seed=0,1,2", ENDLESS, cwd=tmp_path) as process:
@@ -115,6 +117,7 @@ def test_slurms_warning_interrupts_a_job_and_a_restart_has_the_rest(cluster: Clu
     assert "the rest did not finish; resume with: python " in errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cluster", ["slurm"], indirect=True)
 def test_what_slurm_refuses_is_one_sentence(cluster: Cluster, tmp_path: Path) -> None:
     done = cluster.sweep("seed=range(150)", cwd=tmp_path)

@@ -53,6 +53,7 @@ def sweeps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return cwd
 
 
+@pytest.mark.slow
 def test_runs_that_were_asked_for_at_once_name_each_other_and_others_are_the_run_alone(sweeps: Path) -> None:
     jobs = json.loads((sweeps / "asked" / "sweep.json").read_text())["jobs"]
     for name in NAMES:

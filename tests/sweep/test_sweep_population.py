@@ -44,6 +44,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return cwd / "calm"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [(), WORKERS])
 def test_each_run_is_the_run_alone(words: tuple[str, ...], alone: Path, tmp_path: Path) -> None:
     done = sweep("together", *JOBS, *words, cwd=tmp_path)
@@ -56,6 +57,7 @@ def test_each_run_is_the_run_alone(words: tuple[str, ...], alone: Path, tmp_path
     assert {path.name for path in together.iterdir()} == {path.name for path in alone.iterdir()}
 
 
+@pytest.mark.slow
 def test_members_that_are_refused_or_diverge_leave_the_others_alone(tmp_path: Path) -> None:
     """A mistake is found before; a rate is refused as training begins, or makes no finite numbers."""
     words = ("agent=dqn", *SMALL, "agent.gradient_steps=1", "agent.learning_rate=1e20,0.001,1e38,-1,0.002")
@@ -118,6 +120,7 @@ def test_runs_whose_folder_is_lost_or_full_end_alone(
         assert differences(left_behind(tmp_path / str(seed)), calm[seed]) == []
 
 
+@pytest.mark.slow
 def test_runs_that_are_certified_end_when_they_would_alone(tmp_path: Path) -> None:
     """With `evaluation.stop_after`; the first to be done is not waited for."""
     words = ["agent=ppo", "env.layout=aima_4x3", *SMALL, "total_timesteps=16384", "evaluation.stop_after=1"]
@@ -140,6 +143,7 @@ def long_alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return cwd / "calm"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "launcher"),
     [(signal.SIGTERM, ()), (signal.SIGINT, ("hydra/launcher=basic",)), (signal.SIGINT, WORKERS)],

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from helpers.support import ROOT
 
 MOST = 69
@@ -31,6 +32,7 @@ finally:
 """
 
 
+@pytest.mark.slow
 def test_a_run_that_was_never_interrupted_calls_few_files_and_none_of_resuming(tmp_path: Path) -> None:
     few = ("total_timesteps=4000", "evaluation.every=1000", "agent.learning_starts=1000")  # no certificate
     words = [str(ROOT / "scripts" / "train.py"), "agent=dqn", *few, "hydra.run.dir=run"]

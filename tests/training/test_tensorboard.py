@@ -68,6 +68,7 @@ def ask(address: str, path: str, **question: Any) -> Any:
         return json.load(answer)
 
 
+@pytest.mark.slow
 def test_scalars_stand_beside_their_optimum(served: str) -> None:
     tags = ask(served, "data/plugin/scalars/tags")
     assert tags.keys() == {f"{agent}_run" for agent in SHOWN}
@@ -127,6 +128,7 @@ def test_the_hparams_table_has_settings_and_metrics(served: str) -> None:
     assert {chart["title"]: chart["multiline"]["tag"] for chart in category["chart"]} == CHARTS
 
 
+@pytest.mark.slow
 def test_the_hparams_table_opens_with_what_varies_and_the_results(served_sweep: str) -> None:
     table = ask(served_sweep, "data/plugin/hparams/experiment", includeMetrics=True)
     differing = {info["name"] for info in table["hparamInfos"] if info["differs"]}

@@ -50,6 +50,7 @@ def studied(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_search_leaves_a_row_per_trial_and_a_verdict(studied: Path) -> None:
     found = rows(studied)
     assert [row["trial"] for row in found] == [str(number) for number in range(6)]
@@ -78,6 +79,7 @@ def test_its_winner_is_a_recipe_of_train_py(studied: Path) -> None:
         assert config["total_timesteps"] == 1500
 
 
+@pytest.mark.slow
 def test_a_study_of_a_world_by_its_id_leaves_a_recipe_that_trains_there(tmp_path: Path) -> None:
     world = ("env=gymnasium", "env.id=FrozenLake-v1", "env.kwargs.is_slippery=false", "tuned=none")
     done = script("tune.py", *QUICK, *world, "tune.trials=2", cwd=tmp_path)
@@ -98,6 +100,7 @@ def test_the_same_line_goes_on_with_the_study(studied: Path) -> None:
     assert rows(studied)[:6] == before
 
 
+@pytest.mark.slow
 def test_damaged_runs_of_the_confirmation_are_run_again(studied: Path, tmp_path: Path) -> None:
     shutil.copytree(studied / "study", tmp_path / "study")
     runs = sorted((tmp_path / "study" / "confirm").glob("*,seed=*"))
@@ -114,6 +117,7 @@ def test_damaged_runs_of_the_confirmation_are_run_again(studied: Path, tmp_path:
     report_command.main([str(tmp_path / "study"), "--formats"])
 
 
+@pytest.mark.slow
 def test_the_report_shows_the_study(studied: Path, tmp_path: Path) -> None:
     report_command.main([str(studied / "study"), "--out", str(tmp_path / "out")])
     page = (tmp_path / "out" / "report.html").read_text()
@@ -261,6 +265,7 @@ def check_ended(processes: list[int]) -> None:
     wait_for(lambda: all(map(is_gone, processes)), "the workers' end")
 
 
+@pytest.mark.slow
 def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path: Path) -> None:
     with start("tune.py", *QUICK, *LONG, cwd=tmp_path) as process:
         killed = wait_for_workers(process, 2)[0]
@@ -282,6 +287,7 @@ def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path
     assert [row["status"] for row in found] == ["done"] * 3
 
 
+@pytest.mark.slow
 def test_a_search_of_one_worker_is_the_same_however_it_is_killed(tmp_path: Path) -> None:
     words = [*QUICK, "env=river_swim", "total_timesteps=12000", "tune.trials=3"]
 
@@ -315,6 +321,7 @@ def test_a_search_of_one_worker_is_the_same_however_it_is_killed(tmp_path: Path)
     assert outcome(tmp_path / "killed") == outcome(tmp_path / "calm")
 
 
+@pytest.mark.slow
 def test_a_database_that_disappears_is_one_sentence_and_no_worker_is_left(tmp_path: Path) -> None:
     with start("tune.py", *QUICK, *LONG, cwd=tmp_path) as process:
         workers = wait_for_workers(process, 2)

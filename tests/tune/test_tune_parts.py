@@ -141,6 +141,7 @@ agent:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", ["on the command line", "in a file", "in a file that leaves it open"])
 @pytest.mark.parametrize("source", SOURCES)
 def test_the_recipe_of_a_study_in_any_world_is_of_that_world(
@@ -247,6 +248,7 @@ def reported(objective: Objective, rates: dict[int, float]) -> tuple[list[Outcom
     return trials(answer), sorted(reports, key=lambda report: (report.trial, report.step))
 
 
+@pytest.mark.slow
 def test_trials_and_seeds_that_train_together_are_those_that_train_one_by_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -337,6 +339,7 @@ def test_a_trial_that_is_worse_than_the_median_is_pruned(tmp_path: Path) -> None
     assert all(len(trial.intermediate_values) == 10 for trial in study.trials)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("word", "killed"), [("tune.sampler=tpe", (0, 1)), ("tune.pruner=hyperband", (3, 11))]
 )

@@ -310,6 +310,7 @@ def test_an_environment_with_a_table_is_put_into_each_state(env_id, states, size
     }
 
 
+@pytest.mark.slow
 def test_an_enumerated_environment_takes_the_same_walk():
     name, short = "MiniGrid-Empty-5x5-v0", {"max_steps": 12}
     mdp = compile_id(name, short)

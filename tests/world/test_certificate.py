@@ -184,6 +184,7 @@ def accepted(checker: ModuleType, found: Any) -> Fraction | None:
     return Fraction(best) - worth
 
 
+@pytest.mark.slow
 def test_falsified_files_claim_no_more_than_is_true(holding: list[dict[str, Any]]) -> None:
     numbers, checker, kept = np.random.default_rng(0), _checker(), 0
     for number in range(FALSIFIED):
@@ -287,6 +288,7 @@ def verdicts(source: str, texts: list[str]) -> list[Any]:
     return found
 
 
+@pytest.mark.slow
 def test_every_check_of_the_script_matters(holding: list[dict[str, Any]]) -> None:
     source, texts = SCRIPT.read_text(), battery(holding)
     whole = verdicts(source, texts)

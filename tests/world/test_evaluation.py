@@ -29,6 +29,7 @@ CLASSIC = Evaluator(compile_mdp(load("classic")), 0.99, 100)
 SLIPPERY = [("four_rooms", 0.2), ("classic", 0.5), ("frozen_lake_4x4", 2 / 3)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("layout", "slip"), SLIPPERY)
 def test_sampled_intervals_cover_at_their_rate(layout: str, slip: float) -> None:
     """Over 100 seeds; shares of rare ends, and means that these carry, may be covered more often."""
@@ -231,6 +232,7 @@ def test_intervals_of_few_episodes_are_within_what_is_possible() -> None:
     assert few.length.low == 5  # the nearest trap is one down and four to the right
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slip", [0.0, 0.3])
 def test_the_ends_of_intervals_are_those_of_all_walks(slip: float) -> None:
     evaluator = Evaluator(compile_mdp(parse("A=5\nS.G\n.TA", "small"), slip, -0.5), 0.9, 6)
@@ -355,6 +357,7 @@ def test_without_a_tie_nothing_is_said_of_a_discount_of_1(words: str) -> None:
     assert note(*words.split()) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words", ["agent=q_learning agent.gamma=1", "agent=dqn agent.gamma=0.5 env.slip=0.2"]
 )

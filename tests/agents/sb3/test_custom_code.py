@@ -292,6 +292,7 @@ class Counts(BaseCallback):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("named", ["derived.{}", "derived:{}", "derived.py:{}", "others/random.py:{}"])
 def test_a_class_derived_from_a_known_one_has_its_settings(
     named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

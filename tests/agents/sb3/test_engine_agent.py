@@ -61,6 +61,7 @@ for name in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 def test_a_model_file_opens_where_this_package_is_not_installed(tmp_path: Path) -> None:
     counting = [f"agent.replay_buffer_class={OURS}.replay_counts.ReplayCounts"]
     cases = {

@@ -267,6 +267,7 @@ TRUTH: dict[str, tuple[Callable[[], Any], float]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", TRUTH)
 def test_environments_as_people_have_them(what: str) -> None:
     make, truth = TRUTH[what]
@@ -343,6 +344,7 @@ WRAPPED: dict[str, tuple[Callable[[], Any], float]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", WRAPPED)
 def test_wrappers_belong_to_the_world(what: str) -> None:
     make, truth = WRAPPED[what]
@@ -429,6 +431,7 @@ def test_tables_are_by_the_environments_own_numbers() -> None:
         gridworld.evaluate([1] * 30, fewer)
 
 
+@pytest.mark.slow
 def test_the_environment_is_left_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(budget, "_SLOW", -1.0)  # what keeps growing is looked for at once
     monkeypatch.setattr(budget, "_FIRST", -1.0)
@@ -481,6 +484,7 @@ class Fuel(FrozenLakeEnv):
         return observation, reward, over or self.fuel == 0, *rest
 
 
+@pytest.mark.slow
 def test_a_table_is_a_shortcut_only_where_it_is_all_of_the_state() -> None:
     tired = gridworld.compile_env(wrappers.TimeLimit(Tired(is_slippery=False), 12))
     assert Evaluator(tired, 0.95, 12).optimal_value >= 9 * 0.95**9
@@ -604,6 +608,7 @@ def test_what_is_no_world_is_refused_in_a_sentence(what: str) -> None:
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_plain_sb3_on_the_tutorials_world() -> None:
     """A Dict and a random target, given as an object, in a batch, and to the callback."""
     venv = DummyVecEnv([lambda: Monitor(wrappers.TimeLimit(Target(2), 20))])

@@ -343,6 +343,7 @@ WAYS: dict[str, Callable[[Rules], Any]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", RULES)
 def test_sixty_environments(name: str, way: str, monkeypatch: pytest.MonkeyPatch) -> None:

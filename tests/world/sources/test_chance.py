@@ -190,6 +190,7 @@ def test_custom_environments_are_their_tables(compiled: Any, kind: Any, rows: An
     assert mdp.state_name(int(mdp.start_states[0])).startswith("observation ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env_id", "kwargs"),
     [("FrozenLake-v1", {}), ("FrozenLake-v1", {"desc": ["SFH", "FFG"]})],
@@ -244,6 +245,7 @@ def cards(deck: list[int], sab: bool) -> float:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sab", [True, False])
 def test_blackjack_with_few_cards_is_as_good_as_by_its_rules(
     sab: bool, monkeypatch: pytest.MonkeyPatch

@@ -74,6 +74,7 @@ def test_another_world_in_another_process_is_refused(here: None) -> None:
     assert any(each.topic == "process" and "another world" in each.evidence for each in found)
 
 
+@pytest.mark.slow
 def test_the_same_world_in_another_order_is_the_same(here: None) -> None:
     mdp = named_world("ordered:DrawsInOrder")
     assert mdp.truth == "enumerated, 9 states, the same in 4 other processes"

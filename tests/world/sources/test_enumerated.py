@@ -155,6 +155,7 @@ def walk_beside(mdp: Mdp, env: gym.Env[Any, Any], steps: int, entry: str | None 
     return paid
 
 
+@pytest.mark.slow
 def test_minigrid_has_a_state_for_every_position_and_time(empty: Mdp) -> None:
     assert empty.action_names == ("left", "right", "forward", "pickup", "drop", "toggle", "done")
     several = "32 observations stand for several of them"  # at other times
@@ -180,6 +181,7 @@ def test_the_optimum_of_minigrid_is_the_shortest_way_by_its_formula(empty: Mdp) 
     assert (score.value, score.outcome.timeout, score.outcome.expected_length) == (0, 1, LIMIT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["plain", "past", "gate", "decay", "pixels"])
 @pytest.mark.parametrize("limit", [0, 20])
 def test_any_deterministic_environment(variant: str, limit: int) -> None:
@@ -220,6 +222,7 @@ def test_a_reward_for_a_truncation_belongs_to_the_last_step() -> None:
     walk_beside(mdp, gym.make("Corridor-v0", variant="toll", limit=9), 300)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["double", "fuel", "endless"])
 def test_states_that_hold_the_time_end_at_the_step_limit(variant: str) -> None:
     limit = 7 if variant == "endless" else 12  # whose states are all sequences of actions
@@ -230,12 +233,14 @@ def test_states_that_hold_the_time_end_at_the_step_limit(variant: str) -> None:
     walk_beside(mdp, gym.make("ShortCorridor-v0", **kwargs), 500)
 
 
+@pytest.mark.slow
 def test_states_beyond_the_step_limit_that_have_an_end_are_found() -> None:
     mdp = compile_id("ShortCorridor-v0", {"max_episode_steps": 2}, ignore=["steps"])
     assert (mdp.num_states, mdp.max_episode_steps) == (CELLS, 2)
     assert Evaluator(mdp, 1.0, 2).optimum.expected_return == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env_id", "kwargs", "reason"),
     [
@@ -325,6 +330,7 @@ class Counted(Corridor):
         return super().reset(**kwargs)
 
 
+@pytest.mark.slow
 def test_what_changes_with_every_episode_is_named() -> None:
     with pytest.raises(InputError, match=r"the same state \(in episodes\).*ignore"):
         compile_id("Counted-v0", {"limit": 9})

@@ -71,6 +71,7 @@ def outcomes(mdp):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["frozen_lake", "slippery_lake", "cliff_walking", "slippery_cliff", "rainy_taxi"]
 )
