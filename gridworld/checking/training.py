@@ -68,11 +68,9 @@ def settings(config: AgentConfig, probe: Probe, given: Mapping[str, Any]) -> tup
     """The settings of an algorithm on a probe, and its kind; None: it does not take what the probe needs."""
     algorithm: Any = None
     if isinstance(config, SB3ClassConfig):
-        from stable_baselines3.common.base_class import BaseAlgorithm  # imports torch
+        from gridworld.agents.sb3.factory import import_class  # imports torch
 
-        from gridworld.agents.sb3.factory import import_class
-
-        algorithm = import_class("check", config.algorithm, BaseAlgorithm)
+        algorithm = import_class("check", config.algorithm)
         known = _arguments_of(algorithm)
     elif isinstance(config, FunctionConfig):
         known = config.known

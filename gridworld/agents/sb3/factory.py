@@ -90,7 +90,7 @@ def algorithm_and_arguments(
     }
 
 
-def import_class(where: str, path: Any, kind: type) -> Any:
+def import_class(where: str, path: Any, kind: type = BaseAlgorithm) -> Any:
     """Import a class that is derived from `kind`; `where` is the setting that has its path, for messages."""
     where = f"{where}={path}"
     found = named_object(where, str(path))

@@ -46,11 +46,9 @@ def of_library(config: AgentConfig) -> SB3Config | None:
         return None
     if not isinstance(config, SB3ClassConfig):
         return replace(config, algorithm=type(config).algorithm, engine="tabulated")
-    from stable_baselines3.common.base_class import BaseAlgorithm  # imports torch
+    from gridworld.agents.sb3.factory import import_class  # imports torch
 
-    from gridworld.agents.sb3.factory import import_class
-
-    kinds = import_class("agent.algorithm", config.algorithm, BaseAlgorithm).__mro__
+    kinds = import_class("agent.algorithm", config.algorithm).__mro__
     first = next((kind for kind in kinds if kind.__module__.split(".")[0] in _LIBRARIES), None)
     if first in (None, kinds[0]) or not getattr(first, "policy_aliases", None):
         return None
