@@ -198,11 +198,13 @@ def clock_watched() -> Iterator[set[str]]:
     def called(read: Callable[[], Any]) -> Any:
         frame: FrameType | None = sys._getframe(1)
         assert frame is not None
-        file, place = frame.f_code.co_filename, f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
+        file, line = frame.f_code.co_filename, frame.f_lineno
+        if file.startswith(_OURS) or threading.get_ident() != thread:
+            return read()
         while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
             frame = frame.f_back
-        if threading.get_ident() == thread and not file.startswith(_OURS) and frame is None:
-            found.add(place)  # as nothing is being imported
+        if frame is None:  # nothing is being imported
+            found.add(f"{Path(file).name}:{line}")
         return read()
 
     with replaced(*((time, name, partial(called, getattr(time, name))) for name in _CLOCKS)):

@@ -13,6 +13,7 @@ from __future__ import annotations
 import ast
 import dis
 import functools
+import itertools
 import linecache
 import sys
 from collections import Counter
@@ -184,17 +185,21 @@ class Rejecting(Branching):
         frame: FrameType | None = sys._getframe(1)
         while frame is not None and frame.f_code.co_filename in OURS:
             frame = frame.f_back
-        places, held = [], []
+        frames: list[FrameType] = []
         while frame is not None and frame.f_code not in self._runs:
-            code, at, variables = frame.f_code, frame.f_lasti, dict(frame.f_locals)
-            around = _ranges_around(code, at) if _calls(code, at, name) else None
-            if around is None or any(each not in variables for each in around):
-                return None
-            places.append((code, at))
-            held.append(variables)
-            name, frame = code.co_name, frame.f_back
-        if not any(_in_while(code, at) for code, at in places):
+            frames.append(frame)
+            frame = frame.f_back
+        places = [(each.f_code, each.f_lasti) for each in frames]
+        if not any(itertools.starmap(_in_while, places)):
             return None
+        held = []
+        for each, (code, at) in zip(frames, places, strict=True):
+            variables = dict(each.f_locals)
+            around = _ranges_around(code, at) if _calls(code, at, name) else None
+            if around is None or any(named not in variables for named in around):
+                return None
+            held.append(variables)
+            name = code.co_name
         try:
             return tuple(places), self._everything(*held)
         except Exception:  # whatever cannot be copied
