@@ -1,12 +1,13 @@
 """What has changed in a dependency when one of `gridworld.base.workarounds` breaks."""
 
+import argparse
 import subprocess
 import sys
 
 import gymnasium as gym
 import numpy as np
 
-from gridworld.base.workarounds import blas_threads, generator_of
+from gridworld.base.workarounds import blas_threads, generator_of, let_hydra_parse
 
 
 def python(code: str) -> str:
@@ -21,6 +22,17 @@ def test_gymnasium_is_told_of_the_environment_when_it_is_imported() -> None:
     assert python(code).split() == ["False", "GridWorld-v0"], (
         "the registry's module is another, or has another order"
     )
+
+
+def test_a_help_that_is_turned_into_text_later_is_taken() -> None:
+    class Later:  # as Hydra has one
+        def __repr__(self) -> str:
+            return "text"
+
+    let_hydra_parse()
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--completion", help=Later())  # type: ignore[arg-type]
+    assert not parser.parse_args([]).completion
 
 
 def test_what_has_drawn_nothing_has_no_generator() -> None:

@@ -71,7 +71,8 @@ def let_hydra_parse() -> None:
     """Let Hydra 1.3 start on Python 3.14, whose argparse refuses a help that is turned into text later."""
     import argparse
 
-    argparse.ArgumentParser._check_help = lambda self, action: None  # type: ignore[attr-defined]
+    if hasattr(argparse.ArgumentParser, "_check_help"):
+        argparse.ArgumentParser._check_help = lambda self, action: None
 
 
 def keep_compiler_out() -> None:

@@ -34,7 +34,7 @@ from gridworld.base.serialization import State
 from gridworld.engine.environments import Rollout
 from gridworld.engine.networks import Array
 from gridworld.engine.population import FEW_STATES, Population, Run
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray
+from gridworld.world.mdp import FloatArray, IntArray
 
 
 class OnPolicy(Population):
@@ -96,23 +96,6 @@ class OnPolicy(Population):
         `old` are log π (P, S, A) and values (P, S) of the policies that collected them.
         """
         raise NotImplementedError
-
-    def orders(self, count: int, active: BoolArray) -> IntArray:
-        """(P, n), the places of each run's n samples among all, in SB3's own draw of their order."""
-        order = np.zeros((len(self.runs), count), dtype=np.int64)
-        for run in self.going(active):
-            order[run.row] = run.numpy_generator.permutation(count)
-        return order + count * np.arange(len(self.runs))[:, None]
-
-    def minibatches(
-        self, order: IntArray, size: int, *samples: Array
-    ) -> Iterator[tuple[IntArray | None, Sums]]:
-        """Cut samples (P, n) in this order into minibatches of a size, and the last of what is left."""
-        runs, count = order.shape
-        full = count // size * size
-        parts = [order[:, :full].reshape(runs, -1, size), order[:, None, full:]]
-        for part in parts[:1] if full == count else parts:
-            yield from self.summed_up(*(each.take(part) for each in samples))
 
     def summed_up(
         self, pairs: IntArray, advantages: Array, returns: Array

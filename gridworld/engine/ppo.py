@@ -41,8 +41,7 @@ class PPO(OnPolicy):
                 whole = whole or list(self.summed_up(pairs[:, None], advantages[:, None], returns[:, None]))
                 minibatches: Iterator[tuple[IntArray | None, Sums]] = iter(whole)
             else:
-                order = self.orders(pairs.shape[1], active)
-                minibatches = self.minibatches(order, self.batch_size, pairs, advantages, returns)
+                minibatches = self._minibatches(active, pairs, advantages, returns)
             for states, sums in minibatches:
                 logits, values = self.networks.run(states)
                 new = log_softmax(logits), values[..., 0]
@@ -62,6 +61,18 @@ class PPO(OnPolicy):
             for name, mean in means.items():
                 run.record(f"train/{name}", float(mean[run.row]))
         self.check(np.isfinite(means["loss"]), "a loss")
+
+    def _minibatches(self, active: BoolArray, *samples: Array) -> Iterator[tuple[IntArray | None, Sums]]:
+        """Cut samples (P, n), in SB3's own draw of their order, and the last minibatch of what is left."""
+        runs, count = samples[0].shape
+        order = np.zeros((runs, count), dtype=np.int64)
+        for run in self.going(active):
+            order[run.row] = run.numpy_generator.permutation(count)
+        order += count * np.arange(runs)[:, None]  # places among the samples of all runs
+        full = count // self.batch_size * self.batch_size
+        parts = [order[:, :full].reshape(runs, -1, self.batch_size), order[:, None, full:]]
+        for part in parts[:1] if full == count else parts:
+            yield from self.summed_up(*(each.take(part) for each in samples))
 
 
 class _Log:

@@ -50,9 +50,8 @@ WORLD = "world.npz"
 BEST_MODEL = "best_model.zip"  # these two as SB3's EvalCallback names them
 EVALUATIONS = "evaluations.npz"
 RESULTS = (CURVE, SUMMARY, MODEL, BEST_MODEL, VISITS, EVALUATIONS)
-PICTURES = tuple(
-    each.file for each in schema.PICTURES.values() if Path(each.file).suffix
-)  # those of one file
+# those of one file
+PICTURES = tuple(each.file for each in schema.PICTURES.values() if Path(each.file).suffix)
 CHECKED = (*RESULTS, WORLD, *PICTURES)  # what has a checksum in the manifest of a finished run
 CHECKPOINTS = "checkpoints"
 EVENTS = "events.out.tfevents.*"

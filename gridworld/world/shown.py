@@ -176,9 +176,8 @@ class Seen:
         with contextlib.suppress(TypeError):  # of a tuple of what has no hash
             if may_be_met and (met := self._met.get(observation)):
                 return met
-        parts = list(
-            _leaves(observation, self._env.observation_space, self._refusal)
-        )  # whose sizes are known
+        # their sizes are known by the space
+        parts = list(_leaves(observation, self._env.observation_space, self._refusal))
         whole = b"".join(each.tobytes() if isinstance(each, np.ndarray) else each for each in parts)
         seen = whole if len(whole) <= 16 else hashlib.blake2b(whole, digest_size=17).digest()
         if seen not in self.parts:

@@ -146,8 +146,7 @@ class _World:
         if len(found) > 1 or any(len(each) != self.search.num_actions for each in found):
             raise self.search.refusal(
                 "action_masks() depends on what the observations do not show, or has not one entry for each "
-                "of its "
-                f"{self.search.num_actions} actions; show what it depends on"
+                f"of its {self.search.num_actions} actions; show what it depends on"
             )
         return found.pop()
 
