@@ -113,7 +113,7 @@ class GymnasiumConfig(EnvConfig):
     kwargs: Kwargs = setting(dict)  # of gymnasium.make, the class or the function
     ignore: list[Word] = setting(list)  # attributes that are not part of its state, by your word
     # a search that finds more states is refused
-    most_states: int = setting(MOST_STATES, Effect.NOTHING, Bounds(1, 512 * 512))
+    most_states: int = setting(MOST_STATES, Effect.NOTHING, Bounds(1, 1024 * 1024))
     # a search that takes longer is refused
     most_seconds: float = setting(MOST_SECONDS, Effect.NOTHING, Bounds(0, 86_400, above=True))
 

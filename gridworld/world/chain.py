@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -25,10 +25,12 @@ from gridworld.base.bounds import Discount, positive_int
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import check_memory
 from gridworld.base.workarounds import blas_threads
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, steps_from
+from gridworld.world import levels
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, steps_from, steps_to
 
 ORDINARY_GAMMA = 0.9999  # up to here a plain solution of the linear system is accurate
 DENSE_STATES = 512  # up to here a dense matrix is both faster and small
+_MOST_FACTORED = 512 * 512  # states; the factors of more fill the memory
 _ACCURACY = 1e-11  # of sparse factors
 _STEPS_AT_ONCE = 32  # of an episode, before looking whether it can still go on
 
@@ -203,8 +205,21 @@ class Chain:
                 if paying.size:
                     column[steps_to(self.mdp, self._taken, np.isin(self._recurrent, paying)) >= 0] = np.inf
             playing = playing & ~(self._recurrent > 0) & np.isfinite(sums).all(axis=1)
+        if levels.are_enough(self.mdp, gamma):
+            with suppress(levels.NotConvergedError):
+                for column, counted in zip(sums.T, right.T, strict=True):
+                    nothing = np.zeros(len(counted))
+                    column[:] = levels.of(self.mdp).sums(
+                        self.transition, counted, nothing, gamma, levels.ACCURATE
+                    )
+                return sums
         states = np.flatnonzero(playing)
         if states.size:
+            if states.size > _MOST_FACTORED:
+                raise InputError(
+                    f"{self.mdp.name}: {states.size:,} states are too many for gamma={gamma:g}; more than "
+                    f"{_MOST_FACTORED:,} need at most {levels.SWEPT_GAMMA:g}, and values that sweeps find"
+                )
             leaving = self.transition[states][:, np.flatnonzero(~playing)].sum(axis=1)
             leak = (1 - gamma) + gamma * leaving
             sums[states] = factor(gamma * self.transition[states][:, states], leak)(right[states])
@@ -297,21 +312,6 @@ def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
         raise InputError(f"policy: row {state} is {table[state].tolist()}, not a probability distribution")
     normalised: FloatArray = table / total
     return normalised
-
-
-def steps_to(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> IntArray:
-    """(S,), the fewest steps to `targets` (S,) by the outcomes `taken` (S, A, K); -1: there is no way."""
-    steps = np.where(targets, 0, -1)
-    frontier: IntArray = np.flatnonzero(targets)
-    distance = 0
-    while frontier.size:
-        distance += 1
-        around = np.unique(mdp.predecessors(frontier))
-        around = around[steps[around] < 0]
-        leads = ((steps[mdp.next_state[around]] >= 0) & taken[around]).any(axis=(1, 2))
-        frontier = around[leads]
-        steps[frontier] = distance
-    return steps
 
 
 def _value_and_scale(sums: FloatArray) -> tuple[FloatArray, FloatArray]:

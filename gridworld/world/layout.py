@@ -33,7 +33,7 @@ from gridworld.base.user_input import open_users_file
 
 Cell = tuple[int, int]  # (row, column), both from 0, the top-left cell first
 
-MAX_CELLS = 512 * 512
+MAX_CELLS = 1024 * 1024
 MOVES: tuple[Cell, ...] = ((-1, 0), (0, 1), (1, 0), (0, -1))  # up, right, down, left: action 0, 1, 2, 3
 
 CLASSIC = "classic"

@@ -249,6 +249,21 @@ def steps_from(starts: IntArray, next_state: IntArray, taken: BoolArray) -> IntA
     return np.array(steps)
 
 
+def steps_to(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> IntArray:
+    """(S,), the fewest steps to `targets` (S,) by the outcomes `taken` (S, A, K); -1: there is no way."""
+    steps = np.where(targets, 0, -1)
+    frontier: IntArray = np.flatnonzero(targets)
+    distance = 0
+    while frontier.size:
+        distance += 1
+        around = np.unique(mdp.predecessors(frontier))
+        around = around[steps[around] < 0]
+        leads = ((steps[mdp.next_state[around]] >= 0) & taken[around]).any(axis=(1, 2))
+        frontier = around[leads]
+        steps[frontier] = distance
+    return steps
+
+
 def resting_states(next_state: IntArray, probability: FloatArray, reward: FloatArray) -> BoolArray:
     """(S,), the states that no action leaves and nothing is paid in."""
     stays = (next_state == np.arange(len(next_state))[:, None, None]) & (reward == 0)

@@ -35,9 +35,9 @@ from gridworld.world.mdp import (
 from gridworld.world.shown import misfit
 
 MOST_ACTIONS = 256
-MOST_STATES = 512 * 512
+MOST_STATES = 1024 * 1024
 _ROUNDING = 1e-9  # how far a sum of probabilities may be from 1
-_BYTES = 64  # of an outcome in all tables, and while they are made
+_BYTES = 96  # of an outcome in all tables, and while they are made and solved
 _MOST_BYTES = 4 * 2**30
 _LONGEST_TEXT = 200
 _MOST_PLACES = 2**22  # cells of all panels

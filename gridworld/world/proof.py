@@ -126,12 +126,16 @@ class Bounds:
         for times in (4, 16, 64):
             own = times * _UNIT * np.abs(given)
             own[self._states] += lacking
+            before = np.inf
             for _ in range(_ROUNDS):
                 follow = one_hot_policy(actions, self._mdp.num_actions) if policy is None else policy
                 nearer = self._moved(given, sign * Chain(self._mdp, follow).total(own, self._gamma))
                 excess, chosen = self._excess(nearer, sign, policy)
-                if (excess <= 0).all():
+                if (most := excess.max()) <= 0:
                     return nearer
+                if most >= before:  # what is left is rounding
+                    break
+                before = most
                 actions[self._states] = np.where(excess > 0, chosen, actions[self._states])
         return found
 

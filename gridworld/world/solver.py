@@ -29,6 +29,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from gridworld.base.errors import InputError
+from gridworld.world import levels
 from gridworld.world.chain import (
     DENSE_STATES,
     ORDINARY_GAMMA,
@@ -36,17 +37,15 @@ from gridworld.world.chain import (
     Evaluation,
     check_gamma,
     one_hot_policy,
-    steps_to,
 )
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup, steps_to
 
 # Two actions whose values agree to this relative precision are equally good. Rounding stays far below it.
 TIE = 1e-9
-_SWEEP_TOLERANCE = 1e-3  # sweeps need only find a good policy; the rest is solved exactly
+_SWEEP_TOLERANCE = 1e-9  # sweeps need only find a good policy; the rest is solved exactly
 _IMPROVEMENT = 1e-11  # relative; less than that is rounding
 _PATIENT = 100.0  # steps; a longer horizon, 1 / (1 - γ), adds up more of what counts as a tie in one step
 _MOST_SOLUTIONS = 8  # of a world that are kept
-_NOTHING = 1e-290  # a value that has faded so far is 0: the smallest numbers of all never get smaller
 # Relative; less than that is rounding: of elimination without subtractions, of sparse factors, of slopes.
 _VISIBLE, _VISIBLE_IN_LARGE, _SAME_SLOPE = 8e-15, 1e-13, 1e-11
 _KEPT = 1e-10  # relative; a policy that loses more was no improvement
@@ -76,7 +75,15 @@ def value_iteration(mdp: Mdp, gamma: float) -> Solution:
     """
     gamma = check_gamma(gamma)
     ordinary = min(gamma, ORDINARY_GAMMA)
-    greedy: IntArray = np.argmax(backup(mdp, swept_values(mdp, ordinary), ordinary), axis=1)
+    is_accurate = levels.are_enough(mdp, gamma)
+    try:
+        swept = levels.of(mdp).optimum(ordinary, levels.ACCURATE if is_accurate else _SWEEP_TOLERANCE)
+    except levels.NotConvergedError as most:
+        swept, is_accurate = most.args[0], False
+    q = backup(mdp, swept, ordinary)
+    greedy: IntArray = np.argmax(q, axis=1)
+    if is_accurate:
+        return _solution(mdp, gamma, swept, q, _scale(mdp, gamma, greedy, np.abs(swept)))
     if gamma <= ORDINARY_GAMMA:
         return _solve_discounted(mdp, gamma, greedy)
     if gamma == 1:
@@ -104,7 +111,7 @@ def solved(mdp: Mdp, gamma: float) -> Solution:
 def _solve_discounted(mdp: Mdp, gamma: float, greedy: IntArray) -> Solution:
     """Policy iteration from `greedy` (S,)."""
     seen = set()
-    precision = min(1.0, _PATIENT * (1 - gamma))
+    precision = _precision(gamma)
     while True:
         found = Chain(mdp, one_hot_policy(greedy, mdp.num_actions)).evaluation(gamma)
         v, scale = found.value, found.scale
@@ -114,33 +121,26 @@ def _solve_discounted(mdp: Mdp, gamma: float, greedy: IntArray) -> Solution:
         gain = pick(q, best) - pick(q, greedy)
         least = precision * _IMPROVEMENT * np.maximum(pick(q_scale, best), pick(q_scale, greedy))
         seen.add(greedy.tobytes())
-        greedy = np.where(gain > _NOTHING + least, best, greedy)
+        greedy = np.where(gain > levels.NOTHING + least, best, greedy)
         if greedy.tobytes() in seen:  # no better action anywhere; by rounding, perhaps one met before
-            tolerance = precision * TIE * np.maximum(q_scale, pick(q_scale, best)[:, None])
-            return Solution(gamma, v, q, q >= pick(q, best)[:, None] - tolerance, scale)
+            return _solution(mdp, gamma, v, q, scale)
 
 
-def swept_values(mdp: Mdp, gamma: float) -> FloatArray:
-    """Value iteration from V = 0, each sweep only where a successor's value has just changed.
+def _solution(mdp: Mdp, gamma: float, v: FloatArray, q: FloatArray, scale: FloatArray) -> Solution:
+    q_scale, best = backup(mdp, scale, gamma, magnitude=True), np.argmax(q, axis=1)
+    tolerance = _precision(gamma) * TIE * np.maximum(q_scale, pick(q_scale, best)[:, None])
+    return Solution(gamma, v, q, q >= pick(q, best)[:, None] - tolerance, scale)
 
-    Changes are measured relative to the value, so the wave of a far goal is followed to the last cell,
-    however small the discounted value has become there. Measured so, a value that fades away to 0 never
-    comes to rest; sweeping stops when the waves from all ends have long passed.
-    """
-    v = np.zeros(mdp.num_states)
-    playing = ~mdp.absorbing
-    active: IntArray = np.flatnonzero(playing)
-    ways = np.ones(mdp.next_state.shape, dtype=np.bool_)
-    farthest = max(int(steps_to(mdp, ways, ends).max()) for ends in (mdp.goal, mdp.trap))
-    for _ in range(102 + 2 * farthest):
-        if not active.size:
-            break
-        new = backup(mdp, v, gamma, active).max(axis=1)
-        changed = active[np.abs(new - v[active]) > _NOTHING + _SWEEP_TOLERANCE * np.abs(new)]
-        v[active] = new
-        affected = np.union1d(changed, mdp.predecessors(changed))
-        active = affected[playing[affected]]
-    return v
+
+def _precision(gamma: float) -> float:
+    return min(1.0, _PATIENT * (1 - gamma))
+
+
+def _scale(mdp: Mdp, gamma: float, actions: IntArray, near: FloatArray) -> FloatArray:
+    """(S,), the expected discounted sum of |reward| of a policy (S,) in a large world."""
+    paid = pick(np.einsum("sak,sak->sa", mdp.probability, np.abs(mdp.reward)), actions)
+    transition = Chain(mdp, one_hot_policy(actions, mdp.num_actions)).transition
+    return levels.of(mdp).sums(transition, paid, near, gamma, TIE)
 
 
 def _solve_by_value_and_slope(mdp: Mdp, gamma: float, greedy: IntArray) -> tuple[Evaluation, BoolArray]:

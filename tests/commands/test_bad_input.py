@@ -45,7 +45,7 @@ YAMLS: dict[str, bytes] = {
 
 MAPS = {
     "unknown.txt": b"S.x\n..G\n",
-    "large.txt": (b"." * 1000 + b"\n") * 300,  # for the others see world/test_layout.py
+    "large.txt": (b"." * 1000 + b"\n") * 1100,  # for the others see world/test_layout.py
 }
 
 

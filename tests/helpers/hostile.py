@@ -518,7 +518,7 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
     ("interpolation_in_a_number", "must be float", settings({"env.slip": _SECRET_WORD})),
     ("map_file_that_is_the_secret", FINE, settings({"env.layout": "secret.txt"})),
     ("map_file_elsewhere_that_is_the_secret", FINE, world(layout="{base}/secret.txt")),
-    ("map_of_a_million_cells", "at most 262144 cells", _corridors(1000, 998)),
+    ("map_of_a_million_cells", "would take about 1.15 GB of memory", _corridors(1000, 998)),
     ("a_trillion_environments", "n_envs=1000000000000: must be from 1 to", settings({"n_envs": _TRILLION})),
     ("an_episode_of_a_trillion_steps", "env.max_episode_steps=1000000000000: must be from 1 to",
      settings({"env.max_episode_steps": _TRILLION})),

@@ -147,8 +147,8 @@ def test_rewards_are_given_or_replaced(tmp_path):
         (b"S.SG\n..CS\n", r"a cliff 'C' leads back to the start, but there are 3; keep one 'S'"),
         (b"\x89PNG\r\n\x1a\n\x00\xff\xd8", r"not a text file.*byte 1 "),
         (b"S..G\xff\n", r"not a text file.*byte 5 "),
-        (b"S" + b"." * 262143 + b"G", r"too large.*262144"),
-        (b"S" * 2_000_000, r"too large.*262144"),
+        (b"S" + b"." * 1048575 + b"G", r"too large.*1048576"),
+        (b"S" * 5_000_000, r"too large.*1048576"),
     ],
 )
 def test_a_mistake_in_a_map_is_told_with_its_place(tmp_path, raw, mistake):
@@ -261,7 +261,7 @@ def test_a_size_that_contradicts_the_map_is_refused(tmp_path):
         ({"traps": ((1, 1),), "walls": frozenset({(0, 1)})}, "no goal can be reached"),
         ({"num_rows": 0}, "num_rows"),
         ({"num_cols": 3.0}, "num_cols"),
-        ({"num_rows": 1000, "num_cols": 1000}, "too large.*262144"),
+        ({"num_rows": 1025, "num_cols": 1024}, "too large.*1048576"),
     ],
 )
 def test_the_constructor_checks_as_the_parser_does(changes, mistake):

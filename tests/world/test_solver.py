@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridworld import InputError
-from gridworld.world import chain
+from gridworld.world import chain, levels
 from gridworld.world import solver as solve
 from gridworld.world.chain import Chain, one_hot_policy
 from gridworld.world.grid import compile_mdp
-from gridworld.world.layout import load, parse
+from gridworld.world.layout import Layout, load, parse
 
 GAMMAS = st.sampled_from([0, 0.9, 0.99])
 UNIFORM = np.full((30, 4), 0.25)
@@ -46,18 +46,20 @@ def test_a_policy_is_worth_what_brute_force_finds_in_large_worlds_too(data, worl
     policy = data.draw(policies(world))
     slow = world.policy_values(policy, gamma)
     mdp, table = compiled(world), np.array([policy[cell] for cell in world.cells])
-    dense, solutions = chain.DENSE_STATES, []
-    for size in (dense, 0):
+    solutions = []
+    for dense, swept in ((chain.DENSE_STATES, levels.SWEPT_STATES), (0, levels.SWEPT_STATES), (0, 0)):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(chain, "DENSE_STATES", size)
+            patch.setattr(chain, "DENSE_STATES", dense)
+            patch.setattr(levels, "SWEPT_STATES", swept)
             exact, result = Chain(mdp, table).value(gamma), Chain(mdp, table).outcome(max_steps)
             solutions.append(solve.value_iteration(mdp, gamma))
         assert exact == pytest.approx(np.array([slow[cell] for cell in world.cells]), abs=1e-9)
         found = result.goal, result.trap, result.timeout, result.expected_return, result.expected_length
         assert found == pytest.approx(world.episode(policy, max_steps), abs=1e-12)
         assert sum(found[:3]) == pytest.approx(1, abs=1e-12)
-    assert solutions[0].q == pytest.approx(solutions[1].q, abs=1e-11)
-    assert np.array_equal(solutions[0].optimal, solutions[1].optimal)
+    for other in solutions[1:]:
+        assert solutions[0].q == pytest.approx(other.q, abs=1e-11)
+        assert np.array_equal(solutions[0].optimal, other.optimal)
 
 
 def test_the_textbook_world_of_russell_and_norvig():
@@ -147,6 +149,47 @@ def test_a_world_of_200_by_200_cells_fits_into_a_gigabyte():
     assert far == pytest.approx(0.99**397, rel=1e-9)
     assert very_far == pytest.approx(0.5**397, rel=1e-9)
     assert kilobytes < 2**20
+
+
+@pytest.mark.slow
+def test_a_million_states_are_solved_in_the_farthest_cell_too():
+    side, slip = 1000, 0.1
+    mdp = compile_mdp(Layout("open", side, side, starts=((0, 0),), goals=((side // 2, side - 1),)), slip=slip)
+    solution = solve.value_iteration(mdp, 0.99)
+    q = np.zeros((side * side, 4))  # Bellman's equation, from the tables
+    for outcome in range(mdp.probability.shape[2]):
+        there = solution.v[mdp.next_state[:, :, outcome]]
+        q += mdp.probability[:, :, outcome] * (mdp.reward[:, :, outcome] + 0.99 * there)
+    q[mdp.terminal] = 0
+    assert q.max(axis=1) == pytest.approx(solution.v, rel=1e-12, abs=0)
+    assert 0 < solution.v[0] < 1e-6
+    above, below = (solution.v.reshape(side, side)[half] for half in (slice(1, 501), slice(500, 1000)))
+    assert above[::-1] == pytest.approx(below, rel=1e-9)  # mirrored at the goal's row
+
+
+@pytest.mark.parametrize(("slip", "walls"), [(0.0, 0), (0.1, 0), (0.5, 0.2)])
+def test_sweeps_and_factors_find_the_same_optimum(monkeypatch, slip, walls):
+    rng, size = np.random.default_rng(0), 60
+    rows = np.where(rng.random((size, size)) < walls, "#", ".")
+    rows[0, 0], rows[40, 50], rows[41, 50], rows[10, 20] = "S", "G", "T", "G"
+    mdp = made("\n".join(map("".join, rows)), slip=slip)
+    factored = solve.value_iteration(mdp, 0.99)
+    monkeypatch.setattr(levels, "SWEPT_STATES", 0)
+    swept = solve.value_iteration(mdp, 0.99)
+    assert swept.v == pytest.approx(factored.v, rel=1e-9, abs=0)
+    assert swept.scale == pytest.approx(factored.scale, rel=1e-8, abs=0)
+    assert np.array_equal(swept.optimal, factored.optimal)
+
+
+def test_where_sweeps_do_not_come_to_an_end_factors_are_taken_or_the_world_is_refused(monkeypatch):
+    mdp = made("\n".join(["S" + "." * 29, *["." * 30] * 28, "." * 29 + "G"]), slip=0.5)
+    expected = solve.value_iteration(mdp, 0.99)
+    monkeypatch.setattr(levels, "SWEPT_STATES", 0)
+    monkeypatch.setattr(levels, "_MOST_SWEEPS", 3)
+    assert solve.value_iteration(mdp, 0.99).v == pytest.approx(expected.v, rel=1e-11)
+    monkeypatch.setattr(chain, "_MOST_FACTORED", 800)
+    with pytest.raises(InputError, match=r"map: 899 states are too many for gamma=0.99; more than 800 need"):
+        solve.value_iteration(mdp, 0.99)
 
 
 @pytest.mark.parametrize("gamma", [-0.1, 1.1, float("nan"), float("inf"), True, "0.9", None, [0.9], 1j])
