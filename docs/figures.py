@@ -11,6 +11,8 @@ import matplotlib.pyplot as plt
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from gridworld.report.chart import COLOURS, compact, house_style
+
 IMAGES = Path(__file__).parent / "images"
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
@@ -41,30 +43,29 @@ RUNS = {
 CHARTS = ("rollout/ep_rew_mean", "train/explained_variance", "train/approx_kl", "train/clip_fraction")
 
 
+@house_style()
 def draw_charts(folder: Path) -> None:
     """What TensorBoard shows of PPO in a good run and in two bad ones, over the share of their steps."""
     figure, axes = plt.subplots(1, len(CHARTS), figsize=(11, 2.6), layout="constrained")
-    for run, label in RUNS.items():
+    for (run, label), colour in zip(RUNS.items(), COLOURS, strict=False):
         events = EventAccumulator(str(folder / run))
         events.Reload()
         for axis, tag in zip(axes, CHARTS, strict=True):
             points = events.Scalars(tag)
-            axis.plot(
-                [100 * each.step / points[-1].step for each in points],
-                [each.value for each in points],
-                label=label,
-            )
+            shares = [100 * each.step / points[-1].step for each in points]
+            axis.plot(shares, [each.value for each in points], label=label, color=colour)
             axis.set(title=tag, xlabel="% of training")
     axes[1].set_ylim(-1, 1.05)  # the spoilt run's falls to -300
     axes[2].set_yscale("symlog", linthresh=0.01)
+    axes[2].yaxis.set_major_formatter(compact)
     for axis in axes:
-        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(axis="y")
     figure.legend(
         *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(RUNS), frameon=False
     )
     path = folder / "ppo_charts.png"
     figure.savefig(path, dpi=120)
-    Image.open(path).convert("RGB").quantize(64).save(path, optimize=True)  # a third of the size
+    Image.open(path).quantize(64).save(path, optimize=True)  # a third of the size
 
 
 def main() -> None:

@@ -26,7 +26,7 @@ from gridworld.diagnosis.verdict import (
 )
 from gridworld.run.folder import shown
 from gridworld.training.saved_run import SavedRun
-from gridworld.visualization.files import save_png
+from gridworld.visualization.files import save
 
 PICTURE = "diagnosis.png"
 _MOST_ROWS = 8
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str]) -> None:
         path = options.run / PICTURE
         try:
             check_no_link(path)
-            save_png(draw_diagnosis(found), path)
+            save(draw_diagnosis(found), path, fps=1)
             print(f"{shown(path)} shows where the regret comes from")
         except (InputError, OSError) as error:  # the diagnosis is of use without it
             tell(f"{path}: not drawn ({error})")

@@ -194,14 +194,14 @@ def draw(game: Game, cell_size: int) -> Frame:
         is_person = player is game.person
         legend, again = (game.legend(), "; R: restart") if is_person else ("", "")
         board.footer(player.verdict() + again if player.over else legend)
-        boards.append(board.frame())
+        boards.append(board.frame()[..., :3])
     return np.concatenate(boards, axis=1)
 
 
 def _board(player: Player, cell_size: int, with_optimum: bool) -> Sheet:
     mdp, real = player.evaluator.mdp, player.real
     if real is None:
-        canvas = Canvas(mdp, cell_size)
+        canvas = Canvas(mdp, cell_size, opaque=True)
         drawing.draw_world(canvas.world, mdp, player.state, cell_size)
         if with_optimum:
             draw_optimal_actions(canvas, player.evaluator.solution.optimal)
@@ -209,7 +209,7 @@ def _board(player: Player, cell_size: int, with_optimum: bool) -> Sheet:
     frame = real.frame()
     larger = max(1, _LEAST_PICTURE // max(frame.shape))
     height, width = frame.shape[0] * larger, frame.shape[1] * larger
-    sheet = Sheet(width + 2 * _BORDER, height + 2 * _BORDER, _BORDER)
+    sheet = Sheet(width + 2 * _BORDER, height + 2 * _BORDER, _BORDER, opaque=True)
     pixels = frame.repeat(larger, axis=0).repeat(larger, axis=1)
     picture = drawing.import_pygame().image.frombuffer(pixels, (width, height), "RGB")
     sheet.world.blit(picture, (_BORDER, _BORDER))

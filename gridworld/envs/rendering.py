@@ -204,11 +204,11 @@ def draw_frame(mdp: Mdp, state: int | None, cell_size: int = CELL_SIZE) -> Frame
     return surface_to_frame(surface)
 
 
-def surface_to_frame(surface: Any) -> Frame:
-    """The pixels of pygame's surface as a fresh array (height, width, 3), uint8, RGB."""
+def surface_to_frame(surface: Any, form: str = "RGB") -> Frame:
+    """The pixels of pygame's surface as a fresh array (height, width, 3), uint8; or 4, in the form RGBA."""
     width, height = surface.get_size()
-    pixels = import_pygame().image.tobytes(surface, "RGB")
-    return np.frombuffer(pixels, dtype=np.uint8).reshape(height, width, 3).copy()
+    pixels = import_pygame().image.tobytes(surface, form)
+    return np.frombuffer(pixels, dtype=np.uint8).reshape(height, width, len(form)).copy()
 
 
 def pack(frame: Frame) -> Packed:
@@ -257,8 +257,8 @@ def agent_box(mdp: Mdp, state: int, cell_size: int = CELL_SIZE) -> tuple[int, in
     return (col + 1) * cell_size + inset, (row + 1) * cell_size + inset, side, side
 
 
-def draw_grid(surface: Any, board: Board, cell_size: int) -> None:
-    """Lines of one pixel at the edges of the cells that show a state; the names of panels above them."""
+def draw_grid(surface: Any, board: Board, cell_size: int, ink: Colour = INK) -> None:
+    """Lines of one pixel at the edges of the cells that show a state; in ink the names of panels above."""
     draw = import_pygame().draw
     for panel in board.panels:
         rows, cols = slice(panel.top, panel.top + panel.rows), slice(panel.left, panel.left + panel.cols)
@@ -268,7 +268,7 @@ def draw_grid(surface: Any, board: Board, cell_size: int) -> None:
             draw.rect(surface, GRID_LINE, box, 1)
         size = text_size(panel.name, min(round(0.6 * cell_size), 16), panel.cols * cell_size)
         if panel.name and size is not None:
-            write(surface, panel.name, left, round((panel.top + 0.5) * cell_size), size)
+            write(surface, panel.name, left, round((panel.top + 0.5) * cell_size), size, ink)
 
 
 def draw_terminals(surface: Any, board: Board, cell_size: int) -> None:
@@ -333,17 +333,17 @@ def text_size(text: str, size: int, room: float) -> int | None:
     return fitting if fitting >= SMALLEST_TEXT else None
 
 
-def write(surface: Any, text: str, left: int, middle: int, size: int) -> int:
-    """Write a text on paper, in few greys for the palettes of animations; where it ends, in pixels."""
-    image = in_greys(text, size)
+def write(surface: Any, text: str, left: int, middle: int, size: int, ink: Colour = INK) -> int:
+    """Write a text on paper, in few shades for the palettes of animations; where it ends, in pixels."""
+    image = in_greys(text, size, ink)
     surface.blit(image, (left, middle - image.get_height() // 2))
     return left + int(image.get_width())
 
 
 @functools.lru_cache(maxsize=1 << 7)  # captions and legends of a run's pictures have many words in common
-def in_greys(text: str, size: int) -> Any:
-    """A text in black; the opacity of its pixels is one of `GREYS` steps."""
-    image = font(size).render(text, True, INK)
+def in_greys(text: str, size: int, ink: Colour = INK) -> Any:
+    """A text in a colour; the opacity of its pixels is one of `GREYS` steps."""
+    image = font(size).render(text, True, ink)
     alpha = import_pygame().surfarray.pixels_alpha(image)
     step = 255 // (GREYS - 1)
     alpha[...] = alpha // step * step

@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from gridworld.base.errors import InputError
 from gridworld.report import chart
 from gridworld.report.analysis import METRICS, Band, Overall, Result, TaskAnalysis
-from gridworld.report.chart import INK, MUTED, PAPER, Chart, Styles, house_style
+from gridworld.report.chart import INK, PAPER, Chart, Styles, house_style
 from gridworld.report.setting_charts import sweep_charts, sweeps
 from gridworld.report.statistics import INFINITE, Interval
 from gridworld.world import metrics
@@ -290,7 +290,7 @@ def _improvements(metric: str, pairs: Mapping[tuple[str, str], Interval], styles
     title = f"Improvement in {metric}"
     figure, axes, _ = chart.figure_of_rows(title, rows, 26.0)
     axes.set(xlim=(0.0, 1.0), xlabel="probability that the first is better")
-    axes.axvline(0.5, color=MUTED, linewidth=1, linestyle=(0, (3, 3)), clip_on=False)
+    axes.axvline(0.5, color=INK, linewidth=1, linestyle=(0, (3, 3)), clip_on=False)
     for row, ((one, _), found) in enumerate(pairs.items()):
         _draw_interval(axes, row, found, styles[one]["color"])
     description = (

@@ -28,8 +28,8 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from gridworld.base.console import plain
 
-INK, MUTED, PAPER = "#1c2430", "#5d6878", "#ffffff"
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#b8578f", "#c98500", "#3a9bd9", "#4a4f57")  # of agents
+INK, PAPER = "#6b7686", "#ffffff"  # ink that can be read on a light page and on a dark one
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#b8578f", "#c98500", "#3a9bd9", "#86624f")  # of agents
 _DASHES = ("solid", (0, (6.0, 3.0)), (0, (2.0, 2.5)))
 
 WIDTH = 440.0  # points, of a figure; pixels in the page
@@ -105,7 +105,7 @@ class Chart:
         buffer = io.BytesIO()
         with house_style(plain(self.name)):
             scale = 2 if kind == "png" else 1
-            self.figure.savefig(buffer, format=kind, dpi=scale * _POINTS, facecolor=PAPER, metadata=metadata)
+            self.figure.savefig(buffer, format=kind, dpi=scale * _POINTS, metadata=metadata)
         for text in texts:
             text.set_path_effects([])
         return buffer.getvalue()
@@ -128,7 +128,7 @@ def new_figure(
     size = width / _POINTS, (height + 64 + LINE * lines) / _POINTS
     layout = ConstrainedLayoutEngine(w_pad=8 / _POINTS, h_pad=4 / _POINTS)
     figure = NotebookFigure(figsize=size, dpi=_POINTS, layout=layout)
-    axes = figure.add_subplot(facecolor="none")
+    axes = figure.add_subplot()
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
         axis.set_major_formatter(compact)

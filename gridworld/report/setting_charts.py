@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 
 from gridworld.report import chart
 from gridworld.report.analysis import Result, TaskAnalysis
-from gridworld.report.chart import COLOURS, INK, MUTED, PAPER, SMALL, WIDE, Chart, clipped, house_style
+from gridworld.report.chart import COLOURS, INK, PAPER, SMALL, WIDE, Chart, clipped, house_style
 from gridworld.report.grouping import differing, learning_key
 from gridworld.report.statistics import Interval, Share
 from gridworld.report.tables import estimate
@@ -144,7 +144,7 @@ def _line(sweep: Sweep, metric: str, name: str, title: str, description: str) ->
     axes.plot(points, "o-", color=_DONE, linewidth=2.2, markersize=7, clip_on=False)
     axes.vlines(range(len(values)), low, high, color=_DONE, linewidth=4, alpha=0.35, clip_on=False)
     for at in np.flatnonzero(~np.isfinite(ends[:, 0])):
-        axes.annotate("never", (at, top), (0, -10), textcoords="offset points", color=MUTED, ha="center")
+        axes.annotate("never", (at, top), (0, -10), textcoords="offset points", color=INK, ha="center")
     kind = "Wilson's" if is_share else "bootstrap"
     return Chart(name, title, f"{description}, with {kind} 95 % intervals", figure)
 
@@ -168,7 +168,7 @@ def _heatmap(sweep: Sweep, metric: str, name: str, title: str, description: str)
     for at, text in texts.items():
         red, green, blue, _ = mesh.to_rgba(levels[at])
         if len(text) * len(columns) < _LINE:
-            colour = PAPER if 0.299 * red + 0.587 * green + 0.114 * blue < 0.55 else INK
+            colour = PAPER if 0.299 * red + 0.587 * green + 0.114 * blue < 0.55 else "black"
             axes.text(at[1] + 0.5, at[0] + 0.5, text, ha="center", va="center", color=colour)
     axes.set(ylim=(len(rows), 0), xlabel=_short(sweep.keys[1]), ylabel=_short(sweep.keys[0]))
     shown_columns = [clipped(value, max(4, _LINE // len(columns))) for value in columns]
@@ -206,7 +206,7 @@ def _history(tuning: TuningStudy) -> Chart:
     dots: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 6, "clip_on": False}
     looks = {
         "done": {"color": _DONE, "alpha": 0.75, **dots},
-        "pruned, score at that time": {"color": MUTED, "alpha": 0.45, **dots},
+        "pruned, score at that time": {"color": INK, "alpha": 0.45, **dots},
         "best so far": {"color": _WINNER, "linewidth": 2.2, "clip_on": False},
     }
     legend = [(Line2D([], [], **look), name) for name, look in looks.items()]
@@ -233,7 +233,7 @@ def _importances(tuning: TuningStudy) -> Chart:
     figure, axes, _ = chart.figure_of_rows("Importance of each key", names, 26.0, None)
     axes.set(xlim=(0, max(0.01, shares.max())), xticks=[], xlabel="share of the score's variance")
     bars = axes.barh(range(len(ranked)), shares, height=0.46, color=_DONE, clip_on=False)
-    axes.bar_label(bars, [f"{share:.2f}" for _, share in ranked], padding=6, size=SMALL, color=MUTED)
+    axes.bar_label(bars, [f"{share:.2f}" for _, share in ranked], padding=6, size=SMALL, color=INK)
     return Chart(
         f"{tuning.name} importances",
         f"Importance of each key, {tuning.title.lower()}",
@@ -254,7 +254,7 @@ def _parallel(tuning: TuningStudy, done: Sequence[TrialRow]) -> Chart:
     axes.set(xlim=(0, max(1, len(keys))), ylim=(0, 1), xticks=[], yticks=[])
     lines = [list(enumerate(heights)) for heights in zip(*(each for each, _ in columns), strict=True)]
     winner = [line for trial, line in zip(ranked, lines, strict=True) if trial.number == tuning.winner]
-    looks = ((lines[bold:], MUTED, 0.5), (lines[:bold], _DONE, 1.6), (winner, _WINNER, 2.6))
+    looks = ((lines[bold:], INK, 0.5), (lines[:bold], _DONE, 1.6), (winner, _WINNER, 2.6))
     for chosen, colour, width in looks:
         axes.add_collection(LineCollection(chosen, colors=colour, linewidths=width, clip_on=False))
     for index, (name, (_, texts)) in enumerate(zip(["score", *map(_short, keys)], columns, strict=True)):
@@ -264,7 +264,7 @@ def _parallel(tuning: TuningStudy, done: Sequence[TrialRow]) -> Chart:
         below = 0, -18 if index % 2 == 0 else -34  # in two rows, for long names
         axes.annotate(clipped(name, 34), (index, 0), below, weight="bold", ha=side, **place)
         for text, height in texts:
-            axes.annotate(text, (index, height), (5, -4), size=10, color=MUTED, **place)
+            axes.annotate(text, (index, height), (5, -4), size=10, color=INK, **place)
     return Chart(
         f"{tuning.name} parallel coordinates",
         f"Parallel coordinates, {tuning.title.lower()}",

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.envs import rendering as drawing
-from gridworld.envs.rendering import AGENT, GOAL, INK, UNKNOWN, Colour, Frame, Kind, Point, board_of
+from gridworld.envs.rendering import AGENT, GOAL, UNKNOWN, Colour, Frame, Kind, Point, board_of
 from gridworld.visualization.sheet import (
     PAPER,
     UNREACHABLE,
+    WORDS,
     ColourArray,
     Scale,
     Sheet,
@@ -55,7 +56,9 @@ _TRIANGLE = ((0.5, 0.2), (0.8, 0.8), (0.2, 0.8))  # the goal's, as frames have i
 class Canvas(Sheet):
     """A picture of a world that has places. Raises `InputError` where it would be too large to draw."""
 
-    def __init__(self, mdp: Mdp, cell_size: int | None = None, legend_rows: int = 1) -> None:
+    def __init__(
+        self, mdp: Mdp, cell_size: int | None = None, legend_rows: int = 1, opaque: bool = False
+    ) -> None:
         self.mdp, self.board, zoom = mdp, board_of(mdp), 1
         if cell_size is None:
             is_mosaic = len(self.board.panels) > 1
@@ -64,7 +67,8 @@ class Canvas(Sheet):
             zoom = 2 if cell_size >= _NO_GRID and not is_mosaic else 1
             cell_size *= zoom
         width, height = drawing.frame_size(mdp, cell_size)
-        super().__init__(width, height, cell_size, legend_rows, cell_size if mdp.panel_names else 0, zoom)
+        names = cell_size if mdp.panel_names else 0
+        super().__init__(width, height, cell_size, legend_rows, opaque, names, zoom)
 
     def point(self, state: int, right: float, down: float) -> Point:
         """The point that many cells right of and below the state's corner, in pixels of `world`."""
@@ -94,13 +98,15 @@ class Canvas(Sheet):
         cells[is_fixed] = fixed[board.kind[is_fixed]][:, None]
         packed = np.full((*cells.shape[:3], 4), 255, dtype=np.uint8)
         packed[..., :3] = cells
+        packed[board.kind == Kind.BLANK, :, 3] = 0
         pixels = packed.view(np.uint32)[..., 0]
         if parts is None:
             picture = np.repeat(np.repeat(pixels[..., 0], cell, axis=0), cell, axis=1)
         else:
             picture = pixels[:, :, parts].transpose(0, 2, 1, 3)
         size = (board.cols * cell, board.rows * cell)
-        image = drawing.import_pygame().image.frombuffer(np.ascontiguousarray(picture), size, "RGBX")
+        image = drawing.import_pygame().image.frombuffer(np.ascontiguousarray(picture), size, "RGBA")
+        image.set_alpha(None)  # copied, not blended
         self.world.blit(image, (cell, cell))
 
     def draw_world(self, paths: Sequence[list[int]] = (), ways: Sequence[list[int]] = ()) -> None:
@@ -109,7 +115,7 @@ class Canvas(Sheet):
         A path is a line through neighbours, also along the way (S, 2) of a state's action, from a disc.
         """
         if self.has_grid:
-            drawing.draw_grid(self.world, self.board, self.cell)
+            drawing.draw_grid(self.world, self.board, self.cell, WORDS)
         for path in paths:
             self._draw_path([state for state in path if self.board.place[state][0] >= 0], ways)
         if self.has_grid:
@@ -120,7 +126,7 @@ class Canvas(Sheet):
         for panel in self.board.panels:
             left, top = (panel.left + 1) * self.cell - 1, (panel.top + 1) * self.cell - 1
             box = (left, top, panel.cols * self.cell + 2, panel.rows * self.cell + 2)
-            drawing.import_pygame().draw.rect(self.world, INK, box, 1)
+            drawing.import_pygame().draw.rect(self.world, WORDS, box, 1)
 
     def draw_numbers(self, numbers: FloatArray, scale: Scale, name: str, missing: str, caption: str) -> Frame:
         """The finished picture of numbers (S, 1), or (S, 4) in the order of `MOVES`, a triangle for each.
@@ -145,7 +151,7 @@ class Canvas(Sheet):
 
         self.write_numbers(numbers, known, colours, scale.high, size, middle)
         self.caption(caption)
-        unknown = [] if known[playable].all() else [Swatch(missing)]
+        unknown = [] if known[playable].all() else [Swatch(missing, PAPER)]
         self.legend(scale, name, [*unknown, *([UNREACHABLE] if self.hidden else [])])
         return self.frame()
 
@@ -190,19 +196,19 @@ class Canvas(Sheet):
                 size = round(abs(x - to_x) + 2 * thick), round(abs(y - to_y) + 2 * thick)
                 self.world.fill(ink, (left, top, *size))
         if path:
-            self.draw_shape(self.point(path[0], 0.5, 0.5), disc(0.24), AGENT, PAPER)
+            self.draw_shape(self.point(path[0], 0.5, 0.5), disc(0.22), AGENT, PAPER)
 
     def write_values(self, values: FloatArray, chosen: BoolArray, colours: ColourArray, high: float) -> None:
         """Write numbers (S,) off the paths, in the corners of the chosen cells (S,) of these colours (S, 3).
 
         Where corners are too small for them, they are in the middle, on plates.
         """
-        corner = self.number_size(values[chosen], high, 0.36)
+        corner = self.number_size(values[chosen], high, 0.33)
         size = corner or self.number_size(values[chosen], high, 0.8)
-        right = 0.73 if corner else 0.5
+        right = 0.74 if corner else 0.5
         self.write_numbers(
             *(values[:, None], chosen[:, None], colours[:, None], high, size),
-            lambda state, _: self.point(state, right, 0.81),
+            lambda state, _: self.point(state, right, 0.83),
             on_plates=not corner,
         )
 

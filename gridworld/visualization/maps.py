@@ -103,7 +103,7 @@ def learning(subject: Subject) -> Draw:
             return draw_policy_map(mdp, values, greedy, optimal, caption, cell_size, scale, known)
         numbers = np.full(optimal.shape, np.nan)
         np.put_along_axis(numbers, greedy[:, None].astype(np.intp), values[:, None], axis=1)
-        table = StateTable(mdp, states, mdp.action_names, legend_rows=2)
+        table = StateTable(mdp, states, mdp.action_names, legend_rows=2, opaque=True)
         table.paint(numbers, scale, known, written=False)
         return _finish_policy_table(table, states, "value", scale, greedy, optimal, known, caption)
 
@@ -181,10 +181,10 @@ def draw_policy_map(
     """Draw values (S,) as colours, greedy actions (S,) as arrows, and the greedy path from the start.
 
     A cell whose greedy action is not one of the `optimal` (S, A) has a red frame, and one that is not `known`
-    (S,) is grey. With a `scale`, for pictures that are to be compared, no numbers are written; without one,
-    colours are between those `ends` at most.
+    (S,) is grey. With a `scale`, for pictures that are to be compared, no numbers are written and the
+    ground is white; without one, colours are between those `ends` at most.
     """
-    canvas = Canvas(mdp, cell_size, legend_rows=2)
+    canvas = Canvas(mdp, cell_size, legend_rows=2, opaque=scale is not None)
     playable = canvas.board.floor
     known = playable if known is None else known & playable
     shown = scale or linear(VIRIDIS, np.clip(values[known], *ends))

@@ -1,5 +1,7 @@
 """A picture with words: a caption above, in the middle whatever is drawn, a legend below; and colour scales.
 
+Its ground is transparent. Words on it are in a colour that can be read on a light page and on a dark one.
+
 Lightness rises or falls steadily along each scale, so that colour-blind readers see the order of numbers too,
 and a grey print keeps it. A scale has a limited number of colours, which keeps animations within the 256 of a
 GIF.
@@ -16,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gridworld.envs import rendering
 from gridworld.envs.rendering import (
     BACKGROUND,
     INK,
@@ -30,7 +33,6 @@ from gridworld.envs.rendering import (
     surface_to_frame,
     text_size,
     text_width,
-    write,
 )
 from gridworld.world.mdp import BoolArray, FloatArray
 
@@ -39,6 +41,9 @@ ColourArray = NDArray[np.uint8]  # (..., 3), RGB
 PAPER: Colour = BACKGROUND
 DISAGREES: Colour = (213, 60, 50)  # the colour of a greedy action that is not optimal
 UNKNOWN_INK: Colour = (170, 170, 170)
+WORDS: Colour = (107, 118, 134)  # on the ground: a contrast of 4.6 with white and with black
+
+write = functools.partial(rendering.write, ink=WORDS)
 
 _STEPS = 128  # colours of a scale
 _FINER = 4  # times, to which shapes are drawn and made smaller again, for smooth edges
@@ -131,7 +136,7 @@ class Swatch:
     """An entry of the legend: a little cell, filled or framed, and what it means."""
 
     label: str
-    fill: Colour = PAPER
+    fill: Colour | None = None
     frame: Colour = INK
     thick: int = 1
 
@@ -149,7 +154,14 @@ class Sheet:
     """
 
     def __init__(
-        self, width: int, height: int, cell: int, legend_rows: int = 1, names: int = 0, zoom: int = 1
+        self,
+        width: int,
+        height: int,
+        cell: int,
+        legend_rows: int = 1,
+        opaque: bool = False,
+        names: int = 0,
+        zoom: int = 1,
     ) -> None:
         self.cell, self._zoom = cell, zoom
         self.text_size = min(max(cell // 4, 15 * zoom), 20 * zoom)  # of caption and legend, in pixels
@@ -158,8 +170,9 @@ class Sheet:
         top = names + max(0, round(2.6 * self.text_size) - cell)
         bottom = max(0, round((1.1 + 1.5 * legend_rows) * self.text_size) - cell)
         side = max(0, 21 * self.text_size - width + 1) // 2
-        self._surface = import_pygame().Surface((width + 2 * side, top + height + bottom), 0, 32)
-        self._surface.fill(PAPER)
+        size = width + 2 * side, top + height + bottom
+        self._surface = import_pygame().Surface(size, 0 if opaque else import_pygame().SRCALPHA, 32)
+        self._surface.fill((*PAPER, 0))
         self.world: Any = self._surface.subsurface((side, top, width, height))
 
     def number_size(self, numbers: FloatArray, high: float, room: float) -> int:
@@ -242,7 +255,7 @@ class Sheet:
         steps = np.linspace(0, len(scale.ramp) - 1, bar).round().astype(np.intp)
         pixels = np.tile(scale.ramp[steps], (size, 1, 1))
         self._surface.blit(import_pygame().image.frombuffer(pixels, (bar, size), "RGB"), box)
-        import_pygame().draw.rect(self._surface, INK, box, 1)
+        import_pygame().draw.rect(self._surface, WORDS, box, 1)
         left = write(self._surface, high, left + bar + gap, middle, size) + 2 * gap
         if len(rows) > 1:
             wide = self._swatches_width(swatches, size)
@@ -250,16 +263,17 @@ class Sheet:
             left = max(4, min(edge, (total - self._swatches_width(swatches, size)) // 2))
         for swatch in swatches:
             box = (left, middles[-1] - size // 2, size, size)
-            self._surface.fill(swatch.fill, box)
+            self._surface.fill(swatch.fill or (*PAPER, 0), box)
             import_pygame().draw.rect(self._surface, swatch.frame, box, swatch.thick * self._zoom)
             left = write(self._surface, swatch.label, left + size + size // 4, middles[-1], size) + size
 
     def _swatches_width(self, swatches: Sequence[Swatch], size: int) -> int:
-        return sum(size + 3 * (size // 2) + text_width(swatch.label, size) for swatch in swatches)
+        gaps = size * max(0, len(swatches) - 1)
+        return gaps + sum(size + size // 4 + text_width(swatch.label, size) for swatch in swatches)
 
     def frame(self) -> Frame:
-        """The picture's pixels."""
-        return surface_to_frame(self._surface)
+        """The picture's pixels (height, width, 4), RGBA."""
+        return surface_to_frame(self._surface, "RGBA")
 
     def packed(self) -> Packed:
         """The same with one number per pixel, a fresh array."""

@@ -21,9 +21,8 @@ from gridworld.envs.rendering import (
     Point,
     text_size,
     text_width,
-    write,
 )
-from gridworld.visualization.sheet import PAPER, Scale, Sheet, Swatch, short
+from gridworld.visualization.sheet import PAPER, Scale, Sheet, Swatch, short, write
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 _MOST_ROWS = 24
@@ -45,14 +44,17 @@ def table_states(mdp: Mdp, visits: NDArray[np.int64] | None = None) -> IntArray:
 class StateTable(Sheet):
     """A table under construction; `states` (rows,) are those of `table_states`, `columns` are names."""
 
-    def __init__(self, mdp: Mdp, states: IntArray, columns: Sequence[str], legend_rows: int = 1) -> None:
+    def __init__(
+        self, mdp: Mdp, states: IntArray, columns: Sequence[str], legend_rows: int = 1, opaque: bool = False
+    ) -> None:
         names = [mdp.state_name(state) for state in states.tolist()]
         hidden = int((mdp.reachable & ~mdp.terminal).sum()) - len(states)
         self._label = max((text_width(name, _TEXT) for name in names), default=0) + _ROW // 2
         self._column = max(_NARROWEST, min(_WIDEST, _WIDTH // len(columns)))
         self.states = states
         width = self._label + len(columns) * self._column
-        super().__init__(width + 2 * _ROW, (3 + len(states) + (hidden > 0)) * _ROW, _ROW, legend_rows)
+        height = (3 + len(states) + (hidden > 0)) * _ROW
+        super().__init__(width + 2 * _ROW, height, _ROW, legend_rows, opaque)
         for row, name in enumerate(names):
             write(self.world, name, _ROW, self._middle(row), _TEXT)
         sizes = [text_size(name, _TEXT, self._column - 4) for name in columns]
@@ -105,5 +107,5 @@ class StateTable(Sheet):
         """The finished picture of numbers (S, columns); see `Canvas.draw_numbers`."""
         self.paint(table, scale)
         self.caption(caption)
-        self.legend(scale, name, [] if np.isfinite(table[self.states]).all() else [Swatch(missing)])
+        self.legend(scale, name, [] if np.isfinite(table[self.states]).all() else [Swatch(missing, PAPER)])
         return self.frame()
