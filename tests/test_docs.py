@@ -5,10 +5,13 @@ import dataclasses
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from helpers.colours import check_words
 from helpers.pages import PAGES, Reader, blocks, check, module_of
 from helpers.support import ROOT, configure
+from PIL import Image
 
 import gridworld
 from gridworld.config.settings import flat
@@ -115,6 +118,13 @@ def test_the_pictures_are_the_ones_that_a_command_draws() -> None:
     figures = module_of("figures")
     assert {path.name for path in figures.IMAGES.iterdir()} == set(figures.SOURCES)
     assert sum(path.stat().st_size for path in figures.IMAGES.iterdir()) < 600_000
+    for path in figures.IMAGES.glob("*.png"):  # for light pages and dark ones
+        with Image.open(path) as image:
+            pixels = np.asarray(image.convert("RGBA"))
+        assert not pixels[0, :, 3].all()
+        rows = (pixels[..., 3] == 255).any(axis=1)
+        first = int(rows.argmax())  # what begins there is a line of words
+        check_words(pixels[first : first + int(rows[first:].argmin())])
     for line in figures.COMMANDS.splitlines():
         check(line)
 

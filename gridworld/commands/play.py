@@ -194,7 +194,7 @@ def draw(game: Game, cell_size: int) -> Frame:
         is_person = player is game.person
         legend, again = (game.legend(), "; R: restart") if is_person else ("", "")
         board.footer(player.verdict() + again if player.over else legend)
-        boards.append(board.frame()[..., :3])
+        boards.append(board.frame())
     return np.concatenate(boards, axis=1)
 
 
@@ -209,7 +209,7 @@ def _board(player: Player, cell_size: int, with_optimum: bool) -> Sheet:
     frame = real.frame()
     larger = max(1, _LEAST_PICTURE // max(frame.shape))
     height, width = frame.shape[0] * larger, frame.shape[1] * larger
-    sheet = Sheet(width + 2 * _BORDER, height + 2 * _BORDER, _BORDER, opaque=True)
+    sheet = Sheet((width + 2 * _BORDER, height + 2 * _BORDER), _BORDER, opaque=True)
     pixels = frame.repeat(larger, axis=0).repeat(larger, axis=1)
     picture = drawing.import_pygame().image.frombuffer(pixels, (width, height), "RGB")
     sheet.world.blit(picture, (_BORDER, _BORDER))

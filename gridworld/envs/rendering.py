@@ -231,7 +231,14 @@ def draw_world(surface: Any, mdp: Mdp, state: int | None, cell_size: int = CELL_
         for row, col in board.cells[kind]:
             surface.fill(colour, ((col + 1) * cell_size, (row + 1) * cell_size, cell_size, cell_size))
     draw_grid(surface, board, cell_size)
-    draw_terminals(surface, board, cell_size)
+    draw = import_pygame().draw
+    for row, col in board.cells[Kind.TRAP]:
+        draw.circle(surface, TRAP, cell_centre(row, col, cell_size), cell_size // 3)
+    for row, col in board.cells[Kind.GOAL]:
+        x, y = (col + 1) * cell_size, (row + 1) * cell_size
+        corners = [(0.5, 0.2), (0.8, 0.8), (0.2, 0.8)]
+        points = [(x + round(right * cell_size), y + round(down * cell_size)) for right, down in corners]
+        draw.polygon(surface, GOAL, points)
     if state is not None:
         surface.fill(AGENT, agent_box(mdp, state, cell_size))
 
@@ -269,18 +276,6 @@ def draw_grid(surface: Any, board: Board, cell_size: int, ink: Colour = INK) -> 
         size = text_size(panel.name, min(round(0.6 * cell_size), 16), panel.cols * cell_size)
         if panel.name and size is not None:
             write(surface, panel.name, left, round((panel.top + 0.5) * cell_size), size, ink)
-
-
-def draw_terminals(surface: Any, board: Board, cell_size: int) -> None:
-    """Traps as discs, goals as triangles."""
-    draw = import_pygame().draw
-    for row, col in board.cells[Kind.TRAP]:
-        draw.circle(surface, TRAP, cell_centre(row, col, cell_size), cell_size // 3)
-    for row, col in board.cells[Kind.GOAL]:
-        x, y = (col + 1) * cell_size, (row + 1) * cell_size
-        corners = [(0.5, 0.2), (0.8, 0.8), (0.2, 0.8)]
-        points = [(x + round(right * cell_size), y + round(down * cell_size)) for right, down in corners]
-        draw.polygon(surface, GOAL, points)
 
 
 def cell_centre(row: int, col: int, cell_size: int = CELL_SIZE) -> Point:

@@ -153,7 +153,7 @@ def figure_of_rows(
     each = least + LINE * max(name.count("\n") for name in names)
     figure, axes = new_figure(heading, each * len(names), grid)
     axes.set(ylim=(len(names) - 0.5, -0.5), yticks=range(len(names)))
-    axes.set_yticklabels(names, size=LABEL, color=INK)
+    axes.set_yticklabels(names, size=LABEL)
     axes.tick_params(axis="y", pad=10)
     return figure, axes, each
 

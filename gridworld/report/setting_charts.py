@@ -144,7 +144,7 @@ def _line(sweep: Sweep, metric: str, name: str, title: str, description: str) ->
     axes.plot(points, "o-", color=_DONE, linewidth=2.2, markersize=7, clip_on=False)
     axes.vlines(range(len(values)), low, high, color=_DONE, linewidth=4, alpha=0.35, clip_on=False)
     for at in np.flatnonzero(~np.isfinite(ends[:, 0])):
-        axes.annotate("never", (at, top), (0, -10), textcoords="offset points", color=INK, ha="center")
+        axes.annotate("never", (at, top), (0, -10), textcoords="offset points", ha="center")
     kind = "Wilson's" if is_share else "bootstrap"
     return Chart(name, title, f"{description}, with {kind} 95 % intervals", figure)
 
@@ -172,8 +172,8 @@ def _heatmap(sweep: Sweep, metric: str, name: str, title: str, description: str)
             axes.text(at[1] + 0.5, at[0] + 0.5, text, ha="center", va="center", color=colour)
     axes.set(ylim=(len(rows), 0), xlabel=_short(sweep.keys[1]), ylabel=_short(sweep.keys[0]))
     shown_columns = [clipped(value, max(4, _LINE // len(columns))) for value in columns]
-    axes.set_xticks(np.arange(len(columns)) + 0.5, shown_columns, color=INK, size=SMALL)
-    axes.set_yticks(np.arange(len(rows)) + 0.5, [clipped(value, 14) for value in rows], color=INK, size=SMALL)
+    axes.set_xticks(np.arange(len(columns)) + 0.5, shown_columns, size=SMALL)
+    axes.set_yticks(np.arange(len(rows)) + 0.5, [clipped(value, 14) for value in rows], size=SMALL)
     grey = "; grey: no finite value" if (levels < low).any() else ""
     return Chart(name, title, f"{description}; darker is better{grey}", figure)
 
@@ -233,7 +233,7 @@ def _importances(tuning: TuningStudy) -> Chart:
     figure, axes, _ = chart.figure_of_rows("Importance of each key", names, 26.0, None)
     axes.set(xlim=(0, max(0.01, shares.max())), xticks=[], xlabel="share of the score's variance")
     bars = axes.barh(range(len(ranked)), shares, height=0.46, color=_DONE, clip_on=False)
-    axes.bar_label(bars, [f"{share:.2f}" for _, share in ranked], padding=6, size=SMALL, color=INK)
+    axes.bar_label(bars, [f"{share:.2f}" for _, share in ranked], padding=6, size=SMALL)
     return Chart(
         f"{tuning.name} importances",
         f"Importance of each key, {tuning.title.lower()}",
@@ -264,7 +264,7 @@ def _parallel(tuning: TuningStudy, done: Sequence[TrialRow]) -> Chart:
         below = 0, -18 if index % 2 == 0 else -34  # in two rows, for long names
         axes.annotate(clipped(name, 34), (index, 0), below, weight="bold", ha=side, **place)
         for text, height in texts:
-            axes.annotate(text, (index, height), (5, -4), size=10, color=INK, **place)
+            axes.annotate(text, (index, height), (5, -4), size=10, **place)
     return Chart(
         f"{tuning.name} parallel coordinates",
         f"Parallel coordinates, {tuning.title.lower()}",

@@ -66,9 +66,8 @@ class Canvas(Sheet):
             cell_size = drawing.fitting_cell_size(mdp, longest, _LARGEST_CELL)
             zoom = 2 if cell_size >= _NO_GRID and not is_mosaic else 1
             cell_size *= zoom
-        width, height = drawing.frame_size(mdp, cell_size)
         names = cell_size if mdp.panel_names else 0
-        super().__init__(width, height, cell_size, legend_rows, opaque, names, zoom)
+        super().__init__(drawing.frame_size(mdp, cell_size), cell_size, legend_rows, opaque, names, zoom)
 
     def point(self, state: int, right: float, down: float) -> Point:
         """The point that many cells right of and below the state's corner, in pixels of `world`."""
@@ -189,8 +188,8 @@ class Canvas(Sheet):
         for thick, ink in ((half + edge, PAPER), (half, AGENT)) if edge else ((half, AGENT),):
             for (x, y), (to_x, to_y) in segments:
                 if x != to_x and y != to_y:
-                    draw = drawing.import_pygame().draw
-                    draw.line(self.world, ink, (x, y), (to_x, to_y), round(2.8 * thick))
+                    line = drawing.import_pygame().draw.line
+                    line(self.world, ink, (x, y), (to_x, to_y), round(2.8 * thick))
                     continue
                 left, top = round(min(x, to_x) - thick), round(min(y, to_y) - thick)
                 size = round(abs(x - to_x) + 2 * thick), round(abs(y - to_y) + 2 * thick)

@@ -1,7 +1,5 @@
 """A picture with words: a caption above, in the middle whatever is drawn, a legend below; and colour scales.
 
-Its ground is transparent. Words on it are in a colour that can be read on a light page and on a dark one.
-
 Lightness rises or falls steadily along each scale, so that colour-blind readers see the order of numbers too,
 and a grey print keeps it. A scale has a limited number of colours, which keeps animations within the 256 of a
 GIF.
@@ -42,7 +40,6 @@ PAPER: Colour = BACKGROUND
 DISAGREES: Colour = (213, 60, 50)  # the colour of a greedy action that is not optimal
 UNKNOWN_INK: Colour = (170, 170, 170)
 WORDS: Colour = (107, 118, 134)  # on the ground: a contrast of 4.6 with white and with black
-
 write = functools.partial(rendering.write, ink=WORDS)
 
 _STEPS = 128  # colours of a scale
@@ -106,6 +103,7 @@ def is_dark(colours: ColourArray) -> BoolArray:
     return dark
 
 
+Size = tuple[int, int]  # width and height
 Corners = tuple[Point, ...]  # of a shape in a cell, from (0, 0) to (1, 1)
 
 
@@ -146,34 +144,28 @@ UNREACHABLE = Swatch("cannot be reached", UNKNOWN, UNKNOWN_INK)
 
 
 class Sheet:
-    """A picture under construction; `world` is the surface of its middle, `width` x `height` pixels.
+    """A picture under construction; `world` is the surface of its middle, of that `size` in pixels.
 
-    The middle has a border of `cell` pixels, which is the unit of what is drawn in it; `names` is the height
-    of what is written into the upper border itself. The legend has 1 or 2 rows. Words are `zoom` times as
-    large as they have to be.
+    The ground is transparent, so that it fits light pages and dark ones, or white where it is `opaque`. The
+    middle has a border of `cell` pixels, which is the unit of what is drawn in it; `names` is the height of
+    what is written into the upper border itself. The legend has 1 or 2 rows. Words are `zoom` times as large
+    as they have to be.
     """
 
     def __init__(
-        self,
-        width: int,
-        height: int,
-        cell: int,
-        legend_rows: int = 1,
-        opaque: bool = False,
-        names: int = 0,
-        zoom: int = 1,
+        self, size: Size, cell: int, legend_rows: int = 1, opaque: bool = False, names: int = 0, zoom: int = 1
     ) -> None:
-        self.cell, self._zoom = cell, zoom
+        self.cell, self._zoom, (width, height) = cell, zoom, size
         self.text_size = min(max(cell // 4, 15 * zoom), 20 * zoom)  # of caption and legend, in pixels
         self._legend_rows, self._names = legend_rows, names
         # The border of a cell is extended where words would not fit into it.
         top = names + max(0, round(2.6 * self.text_size) - cell)
         bottom = max(0, round((1.1 + 1.5 * legend_rows) * self.text_size) - cell)
         side = max(0, 21 * self.text_size - width + 1) // 2
-        size = width + 2 * side, top + height + bottom
-        self._surface = import_pygame().Surface(size, 0 if opaque else import_pygame().SRCALPHA, 32)
+        whole = width + 2 * side, top + height + bottom
+        self._surface = import_pygame().Surface(whole, 0 if opaque else import_pygame().SRCALPHA, 32)
         self._surface.fill((*PAPER, 0))
-        self.world: Any = self._surface.subsurface((side, top, width, height))
+        self.world: Any = self._surface.subsurface((side, top, *size))
 
     def number_size(self, numbers: FloatArray, high: float, room: float) -> int:
         """The font size at which numbers fit into `room` cells; 0 where they could not be read."""
@@ -272,13 +264,12 @@ class Sheet:
         return gaps + sum(size + size // 4 + text_width(swatch.label, size) for swatch in swatches)
 
     def frame(self) -> Frame:
-        """The picture's pixels (height, width, 4), RGBA."""
-        return surface_to_frame(self._surface, "RGBA")
+        """The picture's pixels (height, width, 4), RGBA, or 3, RGB, where it is opaque."""
+        return surface_to_frame(self._surface, "RGBA" if self._surface.get_masks()[3] else "RGB")
 
     def packed(self) -> Packed:
         """The same with one number per pixel, a fresh array."""
-        columns = np.asarray(self._surface.get_view("2"))
-        return columns.T & np.uint32(0xFFFFFF)
+        return np.asarray(self._surface.get_view("2")).T & np.uint32(0xFFFFFF)
 
 
 def short(number: float, largest: float | None = None) -> str:

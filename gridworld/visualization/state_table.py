@@ -54,7 +54,7 @@ class StateTable(Sheet):
         self.states = states
         width = self._label + len(columns) * self._column
         height = (3 + len(states) + (hidden > 0)) * _ROW
-        super().__init__(width + 2 * _ROW, height, _ROW, legend_rows, opaque)
+        super().__init__((width + 2 * _ROW, height), _ROW, legend_rows, opaque)
         for row, name in enumerate(names):
             write(self.world, name, _ROW, self._middle(row), _TEXT)
         sizes = [text_size(name, _TEXT, self._column - 4) for name in columns]

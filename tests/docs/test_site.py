@@ -1,5 +1,6 @@
 """The site builds without a warning, and no page is wider than the window."""
 
+import itertools
 import json
 import re
 import subprocess
@@ -8,7 +9,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
-from helpers.browser import FITS, chromium
+from helpers.browser import FITS, check_transparent, chromium, look_at
 from helpers.support import ROOT
 
 FORMULA = re.compile(r"\$\$.+?\$\$|\$.+?\$", re.DOTALL)
@@ -25,6 +26,7 @@ PAGES = (  # by what may be too wide: pictures, tables, long commands, tables of
     "reference/api",
     "course/lab1_values",
 )
+PICTURES = ("faq", "how-to/runs", "index", "tutorials/quickstart", "tutorials/standing-still")
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +71,18 @@ def test_the_first_screen_says_how_to_start_and_where_to_go(site: Path, tmp_path
         browser.execute_script("arguments[0].scrollIntoView()", frame)
         browser.switch_to.frame(frame)
         browser.execute_async_script(FITS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [390, 1280])
+def test_pictures_lie_on_the_page_whether_it_is_light_or_dark(site: Path, tmp_path: Path, width: int) -> None:
+    with chromium(tmp_path) as browser:
+        for scheme, page in itertools.product(("light", "dark"), PICTURES):
+            shot = look_at(browser, site / f"{page}.html", scheme, width, 900)
+            check_transparent(browser, shot, "article img:not([src$='.gif'])")
+        look_at(browser, site / "index.html", "dark", width, 900)
+        film = browser.find_element("css selector", "article img[src$='.gif']")
+        assert film.value_of_css_property("border-top-width") == "1px"  # which has a ground of its own
 
 
 @pytest.mark.slow

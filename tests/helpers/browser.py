@@ -1,5 +1,6 @@
 """A headless Chromium for the tests that look at pages; they are skipped where there is none."""
 
+import io
 import os
 import shutil
 from collections.abc import Iterator
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 # In a frame that becomes as high as its page: waits until it is, without a scroll bar; fails if it never is.
 FITS = """
@@ -41,3 +43,24 @@ def chromium(profile: Path) -> Iterator[Any]:
         yield browser
     finally:
         browser.quit()
+
+
+def look_at(browser: Any, page: Path, scheme: str, width: int, height: int) -> Image.Image:
+    """Open a page, light or dark, in a window of that size; a screenshot of all that it has, in RGB."""
+    feature = {"name": "prefers-color-scheme", "value": scheme}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+    screen = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    browser.get(page.as_uri())
+    length = browser.execute_script("return document.documentElement.scrollHeight")
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen | {"height": length})
+    return Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
+
+
+def check_transparent(browser: Any, shot: Image.Image, selector: str) -> None:
+    """At the corner of each of these pictures the page is as it is to the left of it."""
+    pictures = [each.rect for each in browser.find_elements("css selector", selector) if each.is_displayed()]
+    assert pictures
+    for rect in pictures:
+        left, top = round(rect["x"]), round(rect["y"])
+        assert shot.getpixel((left + 2, top + 2)) == shot.getpixel((left - 3, top + 2)), rect

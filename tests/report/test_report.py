@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 import matplotlib
 import numpy as np
 import pytest
+from helpers.colours import check_words
 from helpers.hostile import seal
 from helpers.runs_folder import Maker, sweep, write_study
 from helpers.support import train_in
@@ -597,6 +598,7 @@ def test_figures_and_tables_are_files_too(written: Path) -> None:
             with Image.open(path) as image:
                 assert image.width == 880
                 assert len(image.getcolors(100_000) or []) > 10
+                check_words(np.asarray(image)[:40, :400])  # the heading
         elif path.suffix == ".pdf":
             assert content.startswith(b"%PDF-")
             assert b"/Type3" not in content  # fonts that publishers refuse

@@ -4,15 +4,14 @@ import json
 from pathlib import Path
 
 import pytest
-from helpers.browser import chromium
+from helpers.browser import check_transparent, chromium, look_at
 from helpers.runs_folder import Maker, sweep
 from helpers.support import SHORT, train_in
-from PIL import Image
 
 from gridworld.base.safe_read import sealed
 from gridworld.commands import report as command
 
-SIZES = {"phone": (390, 844), "desktop": (1280, 900)}
+SIZES = ((390, 844), (1280, 900))
 
 
 @pytest.fixture(scope="module")
@@ -40,23 +39,15 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_browser_shows_it(page: Path, tmp_path: Path) -> None:
     with chromium(tmp_path / "profile") as browser:
         for scheme in ("light", "dark"):
-            feature = {"name": "prefers-color-scheme", "value": scheme}
-            browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
-            for name, (width, height) in SIZES.items():
-                screen = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": name == "phone"}
-                browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
-                browser.get(page.as_uri())
-                length = browser.execute_script("return document.documentElement.scrollHeight")
+            for width, height in SIZES:
+                shot = look_at(browser, page, scheme, width, height)
                 wide, seen = browser.execute_script(
                     "const page = document.documentElement; return [page.scrollWidth, page.clientWidth]"
                 )
                 assert wide == seen <= width  # nothing makes the page scroll sideways
-                browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen | {"height": length})
-                picture = tmp_path / f"{name} {scheme}.png"
-                browser.save_screenshot(str(picture))
-                with Image.open(picture) as shot:
-                    corner = shot.convert("L").getpixel((2, 2))
-                    assert (corner > 240) if scheme == "light" else (corner < 40)  # type: ignore[operator]
+                corner = shot.convert("L").getpixel((2, 2))
+                assert (corner > 240) if scheme == "light" else (corner < 40)  # type: ignore[operator]
+                check_transparent(browser, shot, ".chart, .pictures [src*='image/png']")
         headings = browser.execute_script(
             "return [...document.querySelectorAll('h1, h2')].map(h => h.innerText)"
         )

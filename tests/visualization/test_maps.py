@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.colours import check_words, opaque
 from helpers.support import SHORT, train_in
 from PIL import Image
 
@@ -39,7 +40,7 @@ def cell_pictures(mdp: Mdp, frame: Frame) -> dict[int, Frame]:
     pictures = {}
     for state in range(mdp.num_states):
         x, y = (int(side) for side in canvas.point(state, 0, 0))
-        pictures[state] = frame[top + y : top + y + canvas.cell, left + x : left + x + canvas.cell]
+        pictures[state] = opaque(frame[top + y : top + y + canvas.cell, left + x : left + x + canvas.cell])
     return pictures
 
 
@@ -133,6 +134,22 @@ def test_a_path_runs_below_arrows_into_the_goal_and_beside_numbers() -> None:
     goal = cells[path[-1]]
     assert has(goal[:, -len(goal) // 4 :], AGENT)  # up to the triangle
     assert not has(goal[:, : len(goal) // 2], AGENT)
+
+
+def test_the_ground_is_transparent_and_its_words_can_be_read_on_light_and_dark_pages() -> None:
+    best, visits = value_iteration(CLASSIC, 0.99), np.arange(120).reshape(30, 4)
+    greedy = np.argmax(best.optimal, axis=1)
+    two_lines = draw_policy_map(CLASSIC, best.v, greedy, best.optimal, "greedy\nestimates").frame()
+    for frame in (two_lines, draw_error_map(CLASSIC, best.q, "error"), draw_visit_map(CLASSIC, visits, "at")):
+        height, width, _ = frame.shape
+        edges = (frame[0], frame[-1], frame[:, 0], frame[:, -1])
+        assert not any(edge[:, 3].any() for edge in edges)
+        inside = frame[height // 2, :, 3] == 255
+        check_words(frame[: int(0.13 * height)])  # the caption
+        check_words(frame[int(0.88 * height) :, inside.argmax() : inside.argmax() + width // 16])  # "value"
+    still = draw_policy_map(CLASSIC, best.v, greedy, best.optimal, scale=Scale(VIRIDIS, 0, 1)).frame()
+    assert still.shape[2] == 3  # of a film, which has no transparency
+    assert (still[0] == 255).all()
 
 
 def test_an_arrow_has_a_dark_and_a_light_part_on_every_colour() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from helpers.colours import check_words, opaque
 from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError
@@ -91,7 +92,7 @@ def subject(mdp: Mdp, q: NDArray[np.float64], visits: NDArray[np.int64]) -> Subj
 def cell_of(mdp: Mdp, frame: Frame, state: int, legend_rows: int = 1) -> Frame:
     canvas = Canvas(mdp, legend_rows=legend_rows)
     left, top = np.add(canvas.world.get_offset(), canvas.point(state, 0, 0)).astype(int)
-    return frame[top : top + canvas.cell, left : left + canvas.cell]
+    return opaque(frame[top : top + canvas.cell, left : left + canvas.cell])
 
 
 def has(picture: Frame, colour: tuple[int, ...]) -> bool:
@@ -167,6 +168,10 @@ def test_the_policy_of_a_mosaic_has_dots_where_no_action_moves_and_diagonal_path
     best = value_iteration(TAXI, 0.95)
     frame = draw_policy_map(TAXI, best.v, best.optimal.argmax(axis=1), best.optimal).frame()
     cells = [cell_of(TAXI, frame, state, 2) for state in np.flatnonzero(board_of(TAXI).floor)]
+    canvas = Canvas(TAXI, legend_rows=2)
+    top, left = canvas.world.get_offset()[1], canvas.cell
+    check_words(frame[top : top + canvas.cell, left:])  # the names of the upper panels
+    assert not frame[top + 7 * canvas.cell - 4, :, 3].any()  # between two rows of panels
     assert not any(has(cell, DISAGREES) for cell in cells)
     sea = deep_sea(5, mirrored=False)
     frame = draw_policy_map(sea, np.zeros(26), np.ones(26, dtype=int), np.ones((26, 2), dtype=bool)).frame()
@@ -185,7 +190,7 @@ def test_a_table_has_the_most_visited_states_in_the_order_in_which_they_are_met(
 def table_cell(table: StateTable, frame: Frame, row: int, column: int) -> Frame:
     left, top, width, height = table.box(row, column)
     x, y = table.world.get_offset()
-    return frame[y + top : y + top + height, x + left : x + left + width]
+    return opaque(frame[y + top : y + top + height, x + left : x + left + width])
 
 
 @pytest.mark.parametrize("has_q", [True, False])
@@ -199,6 +204,8 @@ def test_a_policy_table_frames_the_greedy_action(has_q: bool) -> None:
         of_it = dataclasses.replace(of_it, snapshot=dataclasses.replace(of_it.snapshot, q=None))
     frame = policy(of_it)(None)
     table = StateTable(world, table_states(world), world.action_names, legend_rows=2)
+    check_words(frame[: table.world.get_offset()[1] + table.box(0, 0)[1]])
+    check_words(frame[:, : table.world.get_offset()[0] + table.box(0, 0)[0]][:180])
     for row in range(5):
         cells = [table_cell(table, frame, row, column) for column in range(2)]
         assert [has(cell, AGENT) for cell in cells] == [False, row != 2]

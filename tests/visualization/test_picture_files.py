@@ -80,11 +80,12 @@ def test_of_too_many_colours_the_frequent_stay_and_others_become_the_nearest() -
 
 def test_png_is_exact() -> None:
     noise = np.random.default_rng(0).integers(256, size=(13, 17, 3), dtype=np.uint8)
+    transparent = np.random.default_rng(1).integers(256, size=(13, 17, 4), dtype=np.uint8)
     half = np.concatenate([np.zeros_like(noise), noise, np.tile(noise[-1:], (9, 1, 1))])
-    for frame in (noise, FRAME, half, noise[:1, :1]):
+    for frame in (noise, FRAME, half, noise[:1, :1], transparent):
         image = Image.open(io.BytesIO(files.encode_png(frame)))
         image.load()  # checks the sums
-        assert image.mode == "RGB"
+        assert image.mode == "RGBA"[: frame.shape[2]]
         assert np.array_equal(np.array(image), frame)
 
 
