@@ -240,7 +240,7 @@ class Sheet:
         size, gap = self.text_size, self.text_size // 2
         beside = self._swatches_width(swatches, size) if len(rows) == 1 else 0
         ends = text_width(low, size) + text_width(high, size) + 2 * gap
-        bar = max(3 * size, min(12 * size, total - 2 * gap - beside - ends))
+        bar = max(3 * size, min(12 * size, total - edge - gap - beside - ends))
         left, middle = max(4, min(edge, (total - bar - beside - ends) // 2)), middles[0]
         left = write(self._surface, low, left, middle, size) + gap
         box = (left, middle - size // 2, bar, size)
