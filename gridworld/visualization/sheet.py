@@ -240,8 +240,8 @@ class Sheet:
         size, gap = self.text_size, self.text_size // 2
         beside = self._swatches_width(swatches, size) if len(rows) == 1 else 0
         ends = text_width(low, size) + text_width(high, size) + 2 * gap
-        bar = max(3 * size, min(12 * size, total - edge - gap - beside - ends))
-        left, middle = max(4, min(edge, (total - bar - beside - ends) // 2)), middles[0]
+        bar = max(3 * size, min(12 * size, total - edge - 3 * gap - beside - ends))
+        left, middle = max(4, min(edge, total - 3 * gap - bar - beside - ends)), middles[0]
         left = write(self._surface, low, left, middle, size) + gap
         box = (left, middle - size // 2, bar, size)
         steps = np.linspace(0, len(scale.ramp) - 1, bar).round().astype(np.intp)
@@ -252,7 +252,7 @@ class Sheet:
         if len(rows) > 1:
             wide = self._swatches_width(swatches, size)
             size = max(SMALLEST_TEXT, int(size * min(1.0, (total - 8) / max(1, wide))))
-            left = max(4, min(edge, (total - self._swatches_width(swatches, size)) // 2))
+            left = max(4, min(edge, total - 4 - self._swatches_width(swatches, size)))
         for swatch in swatches:
             box = (left, middles[-1] - size // 2, size, size)
             self._surface.fill(swatch.fill or (*PAPER, 0), box)
