@@ -162,7 +162,7 @@ def test_the_picture_has_the_world_and_the_cells_that_cost(spoilt: Path) -> None
     found = gridworld.diagnose(spoilt)
     row, col = divmod(int(np.argmax(found.split.cost)), 6)
     cell = draw_diagnosis(found, 40)[(row + 1) * 40 + 4, (col + 1) * 40 + 36]
-    assert cell.tolist() == [127, 0, 0]  # the end of the scale
+    assert cell.tolist() == [127, 0, 0, 255]  # the end of the scale
 
 
 def test_a_world_without_places_is_diagnosed_and_drawn_too() -> None:
