@@ -239,17 +239,17 @@ class Layers:
         if found := self.changed_left():
             raise Changed(found)
 
-    def take(self, without: Sequence[str] = ()) -> bytes:
+    def take(self, without: Sequence[str] = (), with_counts: bool = False) -> bytes:
         """A copy of the state. Equal copies are of equal states; equal states may have several."""
         parts = []
-        for held in self._held(without):
+        for held in self._held(without, with_counts):
             names = tuple(held)
             if names not in self._names:
                 self._names[names] = len(self._names)
             parts.append([self._names[names], *held.values()])
         return self.dump(parts)
 
-    def _held(self, without: Sequence[str] = ()) -> list[dict[str, Any]]:
+    def _held(self, without: Sequence[str], with_counts: bool = False) -> list[dict[str, Any]]:
         held = []
         for layer, left, counters in zip(self.layers, self._left, self._counters, strict=True):
             found = attributes(layer)
@@ -257,7 +257,7 @@ class Layers:
                 now = found.pop(name, Changed)
                 if now is not value and not (type(now) is type(value) in ATOMS and now == value):
                     raise Changed([(self.layers.index(layer), name)])
-            for name, counter in counters.items():
+            for name, counter in () if with_counts else counters.items():
                 if name in found and (type(found[name]) in NUMBERS or type(found[name]) is Unread):
                     found[name] = counter.blank
             held.append({name: found[name] for name in sorted(found) if name not in without})

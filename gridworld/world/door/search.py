@@ -150,6 +150,7 @@ class Search:
             while True:
                 layers.put(self.begin)
                 layers.leave(changing, series)
+                self.begin = layers.take(with_counts=True)  # which shares objects with what is left in place
                 try:
                     if layers.uncertain():
                         if walk(self, np.int64) != as_sent:

@@ -258,6 +258,7 @@ TRUTH: dict[str, tuple[Callable[[], Any], float]] = {
     "a rectangle": (Moved, GAMMA**2),
     "rooms by identity": (Rooms, GAMMA**2),
     "many rooms by identity": (lambda: Rooms(40), GAMMA**38),
+    "so many rooms that they are left in place": (lambda: Rooms(80), GAMMA**78),
     "a generator made in __init__": (SeededInInit, coin()),
     "a generator made in reset": (SeededInReset, coin()),
     "a generator of numpy's made in reset": (OfNumpyInReset, coin()),
