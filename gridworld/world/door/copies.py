@@ -31,24 +31,24 @@ class Anew(BaseException):  # which an environment's `except Exception` does not
 
 
 class Copier(pickle.Pickler):
-    """Copies what no attribute left in place shares a list or a dictionary with."""
+    """Copies what is not known; what is, a list or a dictionary too, is named by its number."""
 
     def __init__(self, file: io.BytesIO, held: Layers, known_objects: dict[Any, Any]) -> None:
         super().__init__(file, protocol=5)
         self._held, self._known = held, known_objects
         self._views: dict[int, list[Any]] = {}  # arrays by that whose memory they show
 
-    def reducer_override(self, obj: Any) -> Any:
-        if obj is _kept:
-            return NotImplemented
-        key = id(obj) if id(obj) in self._known else None
-        if key in self._held.shared:
-            self._held.met_shared.add(key)
-        if key is None and type(obj) not in self._held.ordinary:
-            key = self._held.reference(obj)
-        return (_kept, (key,)) if key is not None else self._taken_apart(obj)
+    def persistent_id(self, obj: Any) -> Any:
+        kind = type(obj)
+        if kind in ATOMS:
+            return None
+        if (key := id(obj)) in self._known:
+            if key in self._held.shared:
+                self._held.met_shared.add(key)
+            return key
+        return None if kind in self._held.ordinary else self._held.reference(obj)
 
-    def _taken_apart(self, obj: Any) -> Any:
+    def reducer_override(self, obj: Any) -> Any:
         if isinstance(obj, np.ndarray):
             if self._held.keeps_views:
                 return _parts_of_view(obj) if isinstance(obj.base, np.ndarray) else NotImplemented
@@ -64,24 +64,7 @@ class Copier(pickle.Pickler):
         return NotImplemented
 
 
-class SharedCopier(Copier):
-    """Asks of lists and dictionaries too whether they are known, which takes three times as long."""
-
-    def persistent_id(self, obj: Any) -> Any:
-        kind = type(obj)
-        if kind in ATOMS or obj is _kept:
-            return None
-        if (key := id(obj)) in self._known:
-            if key in self._held.shared:
-                self._held.met_shared.add(key)
-            return key
-        return None if kind in self._held.ordinary else self._held.reference(obj)
-
-    def reducer_override(self, obj: Any) -> Any:
-        return self._taken_apart(obj)
-
-
-class Recorder(SharedCopier):
+class Recorder(Copier):
     """Notes every object within what it is given."""
 
     def __init__(self, held: Layers) -> None:
@@ -105,21 +88,12 @@ class Reader(pickle.Unpickler):
             return Uniform.of_earlier(self._branching, *key[1:])
         return self._known[key]
 
-    def find_class(self, module: str, name: str) -> Any:
-        ours = (module, name) == (_kept.__module__, _kept.__name__)
-        return self.persistent_load if ours else super().find_class(module, name)
-
 
 def _parts_of_view(view: np.ndarray[Any, Any]) -> Any:
     """What makes a view again, on a copy of the array whose memory it shows."""
     base: Any = view.base
     offset = view.__array_interface__["data"][0] - base.__array_interface__["data"][0]
     return np.ndarray, (view.shape, view.dtype, base, offset, view.strides)
-
-
-def _kept(key: Any) -> Any:
-    """What a copy says in place of an object that is kept as it is; `Reader` reads it."""
-    raise NotImplementedError
 
 
 _new: Any = vars(copyreg)["__newobj__"]  # which pickle knows as a call of __new__

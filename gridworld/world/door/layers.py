@@ -37,7 +37,7 @@ from gridworld.world.door.attributes import (
     spaces_in,
     state_of,
 )
-from gridworld.world.door.copies import ATOMS, Anew, Copier, Reader, Recorder, SharedCopier
+from gridworld.world.door.copies import ATOMS, Anew, Copier, Reader, Recorder
 from gridworld.world.door.counters import NUMBERS, Counter, Key, Unread
 from gridworld.world.door.uniform import Uniform
 
@@ -93,7 +93,6 @@ class Layers:
         self.met_shared = set[int]()
         self.fixed: dict[Any, Any] = {id(each): each for each in (*chain, branching)} | self.shared
         self._known = self.fixed  # and what is within attributes that are left in place
-        self._shares = False  # whether lists and dictionaries are among these
         self._left: list[dict[str, Any]] = [{} for _ in self.layers]  # in place, by layers
         self._names: dict[tuple[str, ...], int] = {}  # of attributes that are copied: their numbers in copies
         self._digest_left = b""
@@ -198,7 +197,7 @@ class Layers:
         A stand-in takes the place of each number that changes and that nothing has read so far; `series`
         has the numbers in some episodes, after the reset and each step.
         """
-        self._left, self._known, self._shares = [{} for _ in self.layers], self.fixed, False
+        self._left, self._known = [{} for _ in self.layers], self.fixed
         self._counters = [{} for _ in self.layers]
         for number, name in changing - self.read:
             values = [[now[number, name] for now in each if (number, name) in now] for each in series]
@@ -223,7 +222,6 @@ class Layers:
             recorder.dump(value)
         # One object stays one, wherever it is held.
         self._known = self.fixed | {id(each): each for each in recorder.met}
-        self._shares = any(type(each) in _PLAIN for each in recorder.met)
 
     def _content_left(self) -> bytes:
         return self.dump(self._left, self.fixed)
@@ -348,9 +346,7 @@ class Layers:
     def dump(self, thing: Any, known_objects: dict[Any, Any] | None = None) -> bytes:
         """A copy of something that may hold the layers, in which what is known is kept as it is."""
         buffer = io.BytesIO()
-        known_objects = self._known if known_objects is None else known_objects
-        shares = self._shares and known_objects is self._known
-        (SharedCopier if shares else Copier)(buffer, self, known_objects).dump(thing)
+        Copier(buffer, self, self._known if known_objects is None else known_objects).dump(thing)
         return buffer.getvalue()
 
     def _load(self, copy: bytes) -> Any:
