@@ -69,11 +69,11 @@ def lumped(steps: Sequence[Sequence[Sequence[Step]]], apart: Sequence[Any]) -> l
         for own, rows in zip(classes, steps, strict=True):
             signature: list[Any] = [own]
             for row in rows:
-                parts = (
+                parts = [
                     ((classes[following] if following >= 0 else following, *shown), probability)
                     for probability, following, *shown in row
-                )
-                signature.append(frozenset(summed(parts).items()))
+                ]
+                signature.append(frozenset(summed(parts).items() if len(parts) > 1 else parts))
             found.append(numbers.setdefault(tuple(signature), len(numbers)))
         classes = found
     return classes

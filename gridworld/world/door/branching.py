@@ -13,7 +13,7 @@ import itertools
 import math
 import sys
 import time
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -67,23 +67,20 @@ class Branching:
         self._is_running = False
         self._num_results = 0
 
-    def outcomes(self, step: Callable[[], Result]) -> dict[Result, Fraction]:
-        """Run a step once for each sequence of draws: its different results, each with its probability."""
-        shares: dict[Result, dict[int, int]] = {}  # numerators by denominators, which is fast
+    def outcomes(self, step: Callable[[], Result], repeats: bool = True) -> dict[Result, Fraction]:
+        """Run a step once for each sequence of draws: its different results, each with its probability.
+
+        Of results, the first 1,000 and one in 1,000 later are repeated, by turns not at all, once and twice.
+        """
+        found: list[tuple[Result, int, int]] = []
         for result in self._every_run(lambda: self._ran(step)):
-            numerator, denominator = self._share()
-            of_result = shares.setdefault(result, {})
-            of_result[denominator] = of_result.get(denominator, 0) + numerator
-            self._num_results += 1
-            if self._num_results <= _REPEATED or self._num_results % _REPEATED == 0:
-                # Once, twice or three times, so that no memory has the same rhythm.
-                for _ in range(1 + self._num_results % 3):
+            found.append((result, *self._share()))
+            self._num_results += repeats
+            if repeats and (self._num_results <= _REPEATED or self._num_results % _REPEATED == 0):
+                for _ in range(self._num_results % 3):  # so that no memory has the same rhythm
                     if self._ran(step) != result:
                         raise self._not_repeatable()
-        return {
-            result: sum((Fraction(part, of) for of, part in each.items()), Fraction(0))
-            for result, each in shares.items()
-        }
+        return shares(found)
 
     def _every_run(self, run: Callable[[], Any]) -> Iterator[Any]:
         """What a run gives with each sequence of decisions, depth first."""
@@ -106,11 +103,6 @@ class Branching:
                 f"{self._where}: a reset or a step has more random outcomes than can be tried in the "
                 f"time allowed: after {number:,} there are more"
             )
-
-    def first(self, step: Callable[[], Result]) -> Result:
-        """The result of a step in which every draw has its first outcome."""
-        self._decisions, self._taken = [], []
-        return self._ran(step)
 
     def _ran(self, step: Callable[[], Result]) -> Result:
         """The result of a step with the decisions that are taken, and first outcomes after them."""
@@ -341,6 +333,18 @@ class Branching:
         if size is None:
             return counts()
         return np.array([counts() for _ in range(math.prod(_shape(size)))]).reshape(*_shape(size), -1)
+
+
+def shares(parts: Iterable[tuple[Result, int, int]]) -> dict[Result, Fraction]:
+    """The sum of what belongs to each result, of numerators and denominators."""
+    sums: dict[Result, dict[int, int]] = {}  # numerators by denominators, which is fast
+    for result, numerator, denominator in parts:
+        of_result = sums.setdefault(result, {})
+        of_result[denominator] = of_result.get(denominator, 0) + numerator
+    return {
+        result: sum((Fraction(part, of) for of, part in each.items()), Fraction(0))
+        for result, each in sums.items()
+    }
 
 
 def _shape(size: Any) -> tuple[int, ...]:

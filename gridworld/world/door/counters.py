@@ -214,7 +214,7 @@ def _only_cuts(search: Search, state: State, steps: list[list[Step]], limit: Cou
             run = functools.partial(search.stepped_from, state.copy, state.depth, np.int64(action))
             cut = summed(
                 ((*shown[:3], shown[2] or shown[3]), probability)
-                for (_, *shown), probability in search.branching.outcomes(run).items()
+                for (_, *shown), probability in search.branching.outcomes(run, repeats=False).items()
             )
             whole = summed(
                 ((each.seen, each.reward, each.terminated, True), each.probability) for each in usual

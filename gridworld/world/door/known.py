@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -83,14 +83,9 @@ def steps_once(layer: Any) -> bool:
     return "step" not in vars(layer) and any(type(layer).step is each.step for each in _ONE_STEP)
 
 
-@lru_cache(1024)
-def _is_kept(kind: type, loaded: tuple[Any, ...]) -> bool:
-    return issubclass(kind, loaded)
-
-
 def is_kept(kind: type) -> bool:
     """Whether objects of a class are no state."""
-    return _is_kept(kind, _loaded(_KEPT))
+    return issubclass(kind, _loaded(_KEPT))
 
 
 def place_of(env: Any, with_step: bool) -> Named:
@@ -119,9 +114,13 @@ def state_reader(env: Any) -> Callable[[Any], Any] | None:
 
 
 def _reset_blackjack(self: Any, *, seed: int | None = None, options: Any = None) -> Any:
-    """Deals without drawing the suit and the face of the card that is painted."""
-    module: Any = sys.modules[_BLACKJACK[0]]
-    self.dealer, self.player = (module.draw_hand(self.np_random) for _ in range(2))
+    """Deals one hand for all that its rules take alike, without the suit and the face that are painted."""
+    deck = sys.modules[_BLACKJACK[0]].deck
+    pairs = [(one, other) for one in deck for other in deck]
+    alike = [(1, sum(pair) - 1) if 1 in pair else (2, sum(pair) - 2) for pair in pairs]
+    for name, hands in (("dealer", pairs), ("player", alike)):
+        code = int(self.np_random.choice([100 * one + other for one, other in hands]))
+        setattr(self, name, list(divmod(code, 100)))
     return self._get_obs(), {}
 
 

@@ -27,8 +27,7 @@ from typing import Any
 import numpy as np
 
 from gridworld.base.errors import InputError
-from gridworld.world.door.beliefs import summed
-from gridworld.world.door.branching import OURS, Branching, Result, Share
+from gridworld.world.door.branching import OURS, Branching, Result, Share, shares
 
 OURS |= {__file__, functools.__file__}
 SAMPLES = 20_000  # real draws that each kind of rejection is compared with
@@ -54,11 +53,6 @@ class _Leaf:
     taken: tuple[int, ...]
     shares: list[Share]
     results: dict[Any, Fraction]
-
-    def share_after(self, depth: int) -> Fraction:
-        """Its share of all runs that took the same so far."""
-        (before, of), (numerator, denominator) = self.shares[depth], self.shares[-1]
-        return Fraction(numerator * of, denominator * before)
 
 
 class _Again(BaseException):  # which an environment's `except Exception` does not catch
@@ -113,13 +107,13 @@ class Rejecting(Branching):
         finally:
             self.sampling = None
 
-    def outcomes(self, step: Callable[[], Result]) -> dict[Result, Fraction]:
+    def outcomes(self, step: Callable[[], Result], repeats: bool = True) -> dict[Result, Fraction]:
         """The different results of a step, each with its probability."""
         self._met, self._across = {}, self._remembers
         if self._remembers:
             return self._merged(step)[0]
         try:
-            return super().outcomes(step)
+            return super().outcomes(step, repeats)
         except _Again:
             pass
         for self._across in (True, False):  # the first is faster, and misled by what is on the stack
@@ -128,7 +122,7 @@ class Rejecting(Branching):
                 return found
         self._takes_all = True
         try:
-            return super().outcomes(step)
+            return super().outcomes(step, repeats)
         finally:
             self._takes_all = False
 
@@ -233,11 +227,11 @@ class Rejecting(Branching):
         """What follows a draw, by the way to it."""
         self.check_time(len(leaves))
         depth, taken = way
-        return summed(
-            (result, share * part)
+        return shares(
+            (result, numerator * of * part.numerator, denominator * before * part.denominator)
             for leaf in leaves
             if leaf.taken[:depth] == taken
-            for share in (leaf.share_after(depth),)
+            for (before, of), (numerator, denominator) in ((leaf.shares[depth], leaf.shares[-1]),)
             for result, part in leaf.results.items()
         )
 
