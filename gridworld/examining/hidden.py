@@ -156,7 +156,7 @@ def _names(search: Search, conflicts: dict[bytes, dict[Any, list[int]]]) -> str:
 
 
 def _values(search: Search, state: int) -> dict[str, bytes]:
-    search.layers.put(search.states[state].copy)
+    search.layers.put(search.states[state].copy, search.states[state].depth)
     held = (each for layer in search.layers.layers for each in held_by(layer))
     return {name: content(value) for name, value in held if is_plain(value)}
 

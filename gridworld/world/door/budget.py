@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gridworld.base.console import ProgressLine
 from gridworld.base.user_input import check_memory
@@ -76,12 +76,14 @@ class Budget:
 
     def _most_values(self) -> str:
         """The attributes with the most values, the elapsed time among them."""
-        values: dict[str, set[bytes]] = {}
+        values: dict[str, set[Any]] = {}
         layers, ignore = self._search.layers, self._search.ignore
-        for copy in [each.copy for each in self._search.states[::SAMPLED] if each.copy][-_MOST_SAMPLES:]:
-            layers.put(copy)
+        for state in [each for each in self._search.states[::SAMPLED] if each.copy][-_MOST_SAMPLES:]:
+            layers.put(state.copy, state.depth)
             for (_, name), key in layers.values(ignore).items():
                 values.setdefault(name, set()).add(key)
+            for clock in layers.clocks:
+                values.setdefault(clock.key[1], set()).add(state.depth)
         most = max(map(len, values.values()), default=0)
         return ", ".join(sorted(name for name, found in values.items() if len(found) == most)) or "state"
 

@@ -71,7 +71,7 @@ def _steps(search: Search, kind: type, numbers: np.random.Generator) -> Iterator
     counters = search.layers.counters
     for took in range(1, _WALK + 1):
         if counters:  # whose stand-ins come with a copy
-            search.layers.put(search.layers.take())
+            search.layers.put(search.layers.take(), took - 1)
             for counter in counters:
                 counter.cuts = counter.is_limit and took in counter.limits
         observation, reward, *over, _ = search.layers.env.step(kind(numbers.integers(search.num_actions)))

@@ -5,6 +5,10 @@ multiply the others without end. So each number that changes is replaced by a st
 may be counted on and passed around. A number that grows by the same in every step, as a count of them, may be
 compared with others too: if the comparison does nothing but truncate, as in a `TimeLimit`, its moment is a
 step limit. Whatever else is done with a stand-in raises `Read`, and then the number is state.
+
+A count of steps that is state is a clock: it has one value at each time. In most steps nothing reads it, or
+it is only compared, so what is found in such a step holds at all times at which the comparisons come out
+alike.
 """
 
 from __future__ import annotations
@@ -12,7 +16,7 @@ from __future__ import annotations
 import functools
 import operator
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -60,10 +64,13 @@ class Counter:
     Args:
         key: the attribute.
         series: its values in some episodes, after the reset and each step.
+        is_clock: whether it is state, since something reads it.
     """
 
-    def __init__(self, key: Key, series: Sequence[Sequence[Any]]) -> None:
-        self.key = key
+    def __init__(self, key: Key, series: Sequence[Sequence[Any]], is_clock: bool = False) -> None:
+        self.key, self.is_clock = key, is_clock
+        self.time = 0  # at which a run begins: how many steps were made before
+        self.asked: dict[Any, bool] | None = None  # a clock's comparisons; None: the number is in its place
         self.blank = Unread(self, None)  # what a copy holds: it says nothing of what it was made from
         self.start = self.step = 0  # after a reset, and what each step adds
         self.cuts = False  # whether comparisons come out as they do at the limit
@@ -72,6 +79,7 @@ class Counter:
         self.num_checked = 0  # of the states, those from which steps were tried at the limit, too
         self.limits: set[int] = set()  # the steps in which a comparison comes out otherwise than before
         self._outcomes: dict[Any, tuple[bool, int | None]] = {}
+        self.kinds = list({type(value) for each in series for value in each})
         self.is_regular = self._fits(series)
 
     def _fits(self, series: Sequence[Sequence[Any]]) -> bool:
@@ -84,26 +92,41 @@ class Counter:
             value == self.start + self.step * took for each in series for took, value in enumerate(each)
         )
 
-    def fresh(self) -> Unread:
-        """What stands for it when a run begins."""
+    def fresh(self, time: int) -> Any:
+        """What stands for it when a run begins after so many steps."""
+        self.time = time
+        if self.is_clock and self.asked is None:
+            return self.kinds[0](self.start + self.step * time)
         return Unread(self, (1, 0) if self.is_regular else None)
 
-    def check(self, value: Any, is_reset: bool) -> None:
-        """Notes whether it is, after a reset or a step in which the episode goes on, what it was to be."""
+    def check(self, value: Any, time: int) -> None:
+        """Notes whether it is, after so many steps in which the episode goes on, what it was to be."""
         if type(value) is Unread:
-            fits = value.counter is self and value.form == (1, self.step) and not is_reset
+            fits = value.counter is self and value.form == (1, self.step) and time > 0
         else:
-            fits = type(value) in NUMBERS and is_reset and value == self.start
+            is_now = type(value) is self.kinds[0] if self.is_clock else type(value) in NUMBERS and not time
+            fits = is_now and value == self.start + self.step * time
         if not fits and self.is_regular:
             self.is_regular = False
-            if self._outcomes:
+            if self._outcomes or self.is_clock:
                 raise Read({self.key})
 
+    def _outcome(self, case: Any, time: int) -> bool:
+        """What a comparison gives in a run that begins after so many steps."""
+        name, (sign, offset), threshold = case
+        return bool(getattr(operator, name)(sign * (self.start + self.step * time) + offset, threshold))
+
+    def holds(self, asked: dict[Any, bool], time: int) -> bool:
+        """Whether these comparisons come out as they did, after so many steps."""
+        return all(self._outcome(case, time) is found for case, found in asked.items())
+
     def compared(self, name: str, form: tuple[int, int], threshold: Any) -> bool:
-        """What a comparison gives before the step in which it changes, or in that one."""
+        """What a comparison gives before the step in which it changes, or in that one; with a clock, now."""
         case = name, form, threshold
+        if self.asked is not None:
+            return self.asked.setdefault(case, self._outcome(case, self.time))
         if (found := self._outcomes.get(case)) is None:
-            found = self._outcomes[case] = self._changes(getattr(operator, name), form, threshold)
+            found = self._outcomes[case] = self._changes(case)
             if found[1] is not None:
                 self.limits.add(found[1])
             if len(self.limits) > 1:
@@ -111,22 +134,14 @@ class Counter:
         usual, limit = found
         return usual is not (self.cuts and limit is not None)
 
-    def _changes(
-        self, compare: Callable[[Any, Any], bool], form: tuple[int, int], threshold: Any
-    ) -> tuple[bool, int | None]:
+    def _changes(self, case: Any) -> tuple[bool, int | None]:
         """What a comparison gives at first, and in which step it gives the other, if in any."""
-        sign, offset = form
-
-        def outcome(step: int) -> bool:
-            return bool(compare(sign * (self.start + self.step * (step - 1)) + offset, threshold))
-
-        slope, first = (
-            sign * self.step,
-            0 if self.is_limit else 1,
-        )  # a `TimeLimit` may cut the first step, too
-        usual, crossing = outcome(first), int((threshold - sign * self.start - offset) // slope) + 1
+        _, (sign, offset), threshold = case
+        first = 0 if self.is_limit else 1  # a `TimeLimit` may cut the first step, too
+        usual = self._outcome(case, first - 1)
+        crossing = int((threshold - sign * self.start - offset) // (sign * self.step)) + 1
         steps = [step for step in range(crossing - 1, crossing + 3) if step > first]
-        return usual, min((step for step in steps if outcome(step) is not usual), default=None)
+        return usual, min((n for n in steps if self._outcome(case, n - 1) is not usual), default=None)
 
 
 class Unread:
@@ -156,6 +171,7 @@ class Unread:
     def _compared(self, name: str, other: Any) -> bool:
         is_number = type(other) in NUMBERS and abs(other) <= _EXACT  # which no NaN is
         is_others = self.counter.is_limit and sys._getframe(1).f_code is not TimeLimit.step.__code__
+        is_others = is_others and not self.counter.is_clock
         if self.form is None or not is_number or not self.counter.is_regular or is_others:
             self._read()
         return self.counter.compared(name, self.form, other)

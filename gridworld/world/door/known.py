@@ -88,7 +88,7 @@ def is_kept(kind: type) -> bool:
     return issubclass(kind, _loaded(_KEPT))
 
 
-def place_of(env: Any, with_step: bool) -> Named:
+def place_of(env: Any) -> Named:
     """The name of a state of MiniGrid's environments, and its place: which way, row and column."""
     place, direction = (getattr(env, name, None) for name in ("agent_pos", "agent_dir"))
     try:
@@ -98,8 +98,7 @@ def place_of(env: Any, with_step: bool) -> Named:
         return "", None
     if carried := getattr(getattr(env, "carrying", None), "type", None):
         facing += f", carrying a {carried}"
-    step = f", step {getattr(env, 'step_count', '?')}" if with_step else ""
-    return f"row {row + 1}, column {column + 1}, {facing}{step}", (facing, row, column)
+    return f"row {row + 1}, column {column + 1}, {facing}", (facing, row, column)
 
 
 def _hands(env: Any) -> Any:

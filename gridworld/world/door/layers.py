@@ -96,7 +96,8 @@ class Layers:
         self._left: list[dict[str, Any]] = [{} for _ in self.layers]  # in place, by layers
         self._names: dict[tuple[str, ...], int] = {}  # of attributes that are copied: their numbers in copies
         self._digest_left = b""
-        self.read: set[tuple[int, str]] = set()  # attributes that something has read
+        self.read: set[Key] = set()  # attributes that something has read,
+        self.clocked: set[Key] = set()  # and those that have one value at each time
         self._counters: list[dict[str, Counter]] = [{} for _ in self.layers]  # numbers that nothing has read
         self._compares_forms = False  # whether what a stand-in was made from counts in a copy
         # Those that cannot be replaced, with their states.
@@ -201,7 +202,8 @@ class Layers:
         self._counters = [{} for _ in self.layers]
         for number, name in changing - self.read:
             values = [[now[number, name] for now in each if (number, name) in now] for each in series]
-            counter = self._counters[number][name] = Counter((number, name), values)
+            is_clock = (number, name) in self.clocked
+            counter = self._counters[number][name] = Counter((number, name), values, is_clock)
             *outer, layer = self.layers[: number + 1]
             counter.is_limit = known.is_limit(layer) and name == "_elapsed_steps"
             counter.only_cuts = counter.is_limit and all(map(known.steps_once, outer))
@@ -261,29 +263,41 @@ class Layers:
             held.append({name: found[name] for name in sorted(found) if name not in without})
         return held
 
-    def put(self, copy: bytes, is_step_next: bool = True) -> None:
-        """Make a copy the state of all layers; numbers that are counted may be compared in a step alone."""
+    def put(self, copy: bytes, time: int | None = 0) -> None:
+        """Make a copy the state of all layers, before a step after so many; None: before a reset."""
         names = list(self._names)
         for layer, left, counters, (number, *values) in zip(
             self.layers, self._left, self._counters, self._load(copy), strict=True
         ):
             held = dict(zip(names[number], values, strict=True)) | left
-            for name, counter in counters.items() if is_step_next else ():
-                if type(held.get(name)) is Unread:
-                    held[name] = counter.fresh()
+            for name, counter in counters.items():
+                if time is not None and type(held.get(name)) is Unread:
+                    held[name] = counter.fresh(time)
             set_attributes(layer, held)
 
     @property
     def counters(self) -> list[Counter]:
         """What is known of numbers that change, and that nothing has read."""
-        return [counter for each in self._counters for counter in each.values()]
+        return [counter for each in self._counters for counter in each.values() if not counter.is_clock]
 
-    def check_counters(self, is_reset: bool) -> None:
-        """Note how numbers that are counted have changed in a reset or a step."""
+    @property
+    def clocks(self) -> list[Counter]:
+        """What is known of those that something reads, and that have one value at each time."""
+        return [counter for each in self._counters for counter in each.values() if counter.is_clock]
+
+    def note_read(self, found: set[Key], has_clocks: bool) -> None:
+        """Take attributes that something has read as state, as clocks if there may be such."""
+        for number, name in found:
+            counter = self._counters[number][name]
+            is_clock = has_clocks and not counter.is_clock and counter.is_regular and len(counter.kinds) == 1
+            (self.clocked if is_clock else self.read).add((number, name))
+
+    def check_counters(self, time: int) -> None:
+        """Note how numbers that are counted have changed in a reset, or in that step."""
         for layer, counters in zip(self.layers, self._counters, strict=True):
             held = attributes(layer) if counters else {}
             for name, counter in counters.items():
-                counter.check(held.get(name), is_reset)
+                counter.check(held.get(name), time)
 
     def numbers(self) -> dict[tuple[int, str], Any]:
         """The attributes that are numbers."""
@@ -295,8 +309,9 @@ class Layers:
         }
 
     def uncertain(self) -> set[Key]:
-        """The counters of which it is not known that they do no more than cut episodes."""
-        return {counter.key for counter in self.counters if not counter.only_cuts}
+        """The stand-ins of which it is not known that they do no more than cut episodes."""
+        clocks = {counter.key for counter in self.clocks if counter.asked is not None}
+        return clocks or {counter.key for counter in self.counters if not counter.only_cuts}
 
     def check_shared(self) -> None:
         """Begin anew if an object that is kept for its modules and classes has changed: then it is state."""

@@ -27,7 +27,7 @@ from gridworld.world.door.beliefs import Step, lumped
 from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES, SAMPLED, Budget
 from gridworld.world.door.checks import Resets, check_by_episodes, check_by_word, walk
 from gridworld.world.door.copies import Anew
-from gridworld.world.door.counters import Read, check_cuts, counted
+from gridworld.world.door.counters import Counter, Read, check_cuts, counted
 from gridworld.world.door.layers import Changed, Env, Layers
 from gridworld.world.door.rejection import Rejecting
 from gridworld.world.outcomes import MOST_ACTIONS
@@ -55,6 +55,7 @@ class State:
     number: int
     depth: int  # steps from the start
     copy: bytes  # b"" where it is no longer needed
+    core: bytes  # a digest of its attributes without clocks
     name: str
     place: tuple[str, int, int] | None  # which way the agent faces, row and column
     is_open: bool = False  # an episode goes on in it
@@ -166,7 +167,7 @@ class Search:
                     layers.check_generators()
                     return
                 except Read as error:
-                    layers.read |= error.found
+                    layers.note_read(error.found, not (self.ignore or self._read or self.has_masks))
                     continue
                 except Changed as error:
                     found = error.found
@@ -194,7 +195,11 @@ class Search:
         self.states: list[State] = []
         self.num_tried = 0
         self.ends: dict[bytes, known.Named] = {}  # what ends are called, by their observations
-        self._by_copy: dict[bytes, State] = {}
+        self._states: dict[
+            tuple[bytes, int], State
+        ] = {}  # by their cores, and by the time if there are clocks
+        self._rows: dict[Any, Any] = {}  # what follows in a core by an action, and where that holds
+        self._reset_cores: set[bytes] = set()  # from which a reset was tried
         self._ended: set[bytes] = set()
         self._waiting_ends: list[bytes] = []  # copies of new ends, from which no reset was tried yet
         budget = self.budget
@@ -238,7 +243,7 @@ class Search:
                 for late in waiting[beyond:]:
                     late.steps = ()
                 del self.states[size:]
-                self._by_copy = {key: each for key, each in self._by_copy.items() if each.number < size}
+                self._states = {key: each for key, each in self._states.items() if each.number < size}
                 self._check_resets(waiting[checked:beyond])
                 break
         self.resets.check(next(each.copy for each in reversed(self.states) if each.copy))
@@ -256,7 +261,7 @@ class Search:
     # ---- runs ----
 
     def reset_from(self, copy: bytes) -> Result:
-        self.layers.put(copy, is_step_next=False)
+        self.layers.put(copy, None)
         try:
             returned = self.layers.env.reset(**self.layers.reset_options)
         except Exception as error:  # whatever it raises
@@ -266,7 +271,7 @@ class Search:
         return *self.state_after(returned[0], 0), 0.0, False, False
 
     def stepped_from(self, copy: bytes, depth: int, action: Any) -> Result:
-        self.layers.put(copy)
+        self.layers.put(copy, depth)
         try:
             returned = self.layers.env.step(action)
         except Exception as error:  # whatever it raises
@@ -297,10 +302,7 @@ class Search:
     def _tried(self, state: State) -> list[list[Step]]:
         """What each action does in a copy of a state."""
         self.budget.check_seconds()
-        steps = [
-            self.merged(functools.partial(self.stepped_from, state.copy, state.depth, np.int64(action)))
-            for action in range(self.num_actions)
-        ]
+        steps = [self._row(state, action) for action in range(self.num_actions)]
         check_cuts(self, state, steps)
         self.num_tried += 1
         if state.mask is not None:
@@ -311,6 +313,39 @@ class Search:
             self.layers.check_left()
         return steps
 
+    def _row(self, state: State, action: int) -> list[Step]:
+        """What an action does in a state: what it does at other times, where no clock says otherwise."""
+        run = functools.partial(self.stepped_from, state.copy, state.depth, np.int64(action))
+        clocks = self.layers.clocks
+        found = self._rows.setdefault((state.core, action), []) if clocks else None
+        if found is None:  # it reads a clock, or there is none
+            return self.merged(run)
+        for conditions, row in found:
+            if all(map(Counter.holds, clocks, conditions, itertools.repeat(state.depth))):
+                return [self._at(step, state.depth + 1) for step in row]
+        for clock in clocks:
+            clock.asked = {}
+        try:
+            row = self.merged(run)
+            found.append(([clock.asked for clock in clocks], row))
+            return row
+        except Read as error:
+            if not error.found <= {clock.key for clock in clocks}:
+                raise
+        finally:
+            for clock in clocks:
+                clock.asked = None
+        self._rows[state.core, action] = None
+        return self.merged(run)
+
+    def _at(self, step: Step, time: int) -> Step:
+        """The same outcome at another time."""
+        if step.following == OVER:
+            return step
+        same = self.states[step.following]
+        state = self._states.get((same.core, time))
+        return step._replace(following=(state or self._added(same, time)).number)
+
     def _check_resets(self, states: Sequence[State]) -> None:
         """A reset from these states, and from the ends that were met, must lead to the same.
 
@@ -318,13 +353,15 @@ class Search:
         """
         self.layers.check_left()
         for state in states:
-            if not state.copy:  # it was tried, before one further than the step limit was refused
+            # It was tried, before one further than the step limit was refused, or at another time.
+            if not state.copy or state.core in self._reset_cores:
                 continue
+            self._reset_cores.add(state.core)
             if state.number.bit_count() <= 1:
                 self.resets.check(state.copy)
             else:
                 self.resets.check_first(state.copy)
-            if state.number % self._kept:
+            if state.number % self._kept and not self.layers.clocks:
                 self.budget.num_bytes -= len(state.copy)
                 state.copy = b""
         while self._waiting_ends:
@@ -340,25 +377,28 @@ class Search:
         """The number of the state that the environment is in, and a digest of the observation."""
         seen = self.seen.digest(observation)
         if is_over and seen not in self.ends:
-            self.ends[seen] = known.place_of(self.layers.base, "step_count" not in self.ignore)
+            self.ends[seen] = self._named(*known.place_of(self.layers.base), depth)
         if self.is_cutting:
             return OVER, seen
         if not is_over and self.branching.sampling is None:
-            self.layers.check_counters(is_reset=depth == 0)
+            self.layers.check_counters(depth)
         if self._read is not None:
             key = pickle.dumps(self._read(self.layers.base))
         else:
             key = self._copied(self.ignore)
         short = hashlib.blake2b(key, digest_size=16).digest()
         if is_over:
-            if short not in self._ended and short not in self._by_copy and self.branching.sampling is None:
+            is_new = short not in self._ended and (short, 0) not in self._states
+            if is_new and self.branching.sampling is None:
                 self._ended.add(short)
                 if self._read is None or not len(self._ended) % SAMPLED:  # by the user's word it is all alike
                     self._waiting_ends.append(self._copied())
             return OVER, seen
-        if (state := self._by_copy.get(short)) is None:
+        time = depth if self.layers.clocks else 0
+        if (state := self._states.get((short, time))) is None:
             copy = self._copied() if self.ignore or self._read else key
-            state = self._by_copy[short] = self._added(copy, depth)
+            like = State(0, 0, copy, short, *known.place_of(self.layers.base))
+            state = self._added(like, depth, len(copy))
         return state.number, seen
 
     def _copied(self, without: Sequence[str] = ()) -> bytes:
@@ -369,14 +409,20 @@ class Search:
         except Exception as error:  # whatever the classes in it raise
             raise self.refusal(f"its state cannot be copied: {in_short(error)}") from error
 
-    def _added(self, copy: bytes, depth: int) -> State:
-        name, place = known.place_of(self.layers.base, "step_count" not in self.ignore)
-        state = State(len(self.states), depth, copy, name, place)
+    def _added(self, like: State, depth: int, num_bytes: int = 0) -> State:
+        """A new state, which is like another but for its time."""
+        name, place = self._named(like.name.partition(", step")[0], like.place, depth)
+        state = State(len(self.states), depth, like.copy, like.core, name, place)
         if self.has_masks:
             state.mask = self._mask()
         self.states.append(state)
-        self.budget.add(len(copy))
-        return state
+        self.budget.add(num_bytes)
+        return self._states.setdefault((like.core, depth if self.layers.clocks else 0), state)
+
+    def _named(self, name: str, place: Any, depth: int) -> known.Named:
+        """The name of a state, with the step of MiniGrid's environments where that is state."""
+        state = {each for _, each in self.layers.clocked | self.layers.read}.difference(self.ignore)
+        return f"{name}, step {depth}" if name and "step_count" in state else name, place
 
     def _mask(self) -> tuple[bool, ...]:
         masks = self.env.get_wrapper_attr("action_masks")()

@@ -10,6 +10,8 @@ from gymnasium import spaces, wrappers
 
 import gridworld
 from gridworld.base.errors import InputError
+from gridworld.world.door import checks
+from gridworld.world.door import search as door_search
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 
@@ -135,6 +137,8 @@ STATE: dict[str, tuple[Callable[[Windy], float], Callable[[Windy], bool]]] = {
     "a bonus for haste": (lambda env: float(env.at == 8) * (4 - env.steps), CUT),
     "two moments": (lambda env: 0.0, lambda env: env.steps >= env.most or (env.at == 4 and env.steps >= 3)),
     "what it was before": (lambda env: float(env.before == 2), CUT),
+    "late in a cell": (lambda env: float(env.at == 4 and env.steps > 2), CUT),
+    "early or late in a cell": (lambda env: float(env.at == 1 and not 1 < env.steps < 4), CUT),
 }
 
 
@@ -166,6 +170,28 @@ def test_a_counter_that_does_more_than_cut_is_state(what: str) -> None:
     mdp = gridworld.compile_env(Paying(*STATE[what]))
     assert mdp.num_states > 9
     played(Paying(*STATE[what]), mdp)
+
+
+def test_steps_in_which_nothing_reads_the_clock_are_made_at_one_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 4,000 and more that a search at each time would make; the reward for haste is read in two cells."""
+    monkeypatch.setattr(checks, "_STEPS", 0)
+    made = []
+
+    class Hasty(Windy):
+        def step(self, action: int) -> Result:
+            made.append(action)
+            shown, reward, over, cut, info = super().step(action)
+            return shown, reward and float(self.most - self.steps), over, cut, info
+
+    mdp = gridworld.compile_env(Hasty(CUT))
+    assert len(made) < 3_000
+    assert mdp.num_states > 400
+    assert mdp.max_episode_steps == 60
+    best = Evaluator(mdp, 1.0, 60).optimal_value
+    monkeypatch.setattr(door_search.Counter, "holds", lambda *_: False)  # each step at each time
+    slow = gridworld.compile_env(Hasty(CUT))
+    assert slow.digest() == mdp.digest()
+    assert best > 50
 
 
 def never(env: Windy) -> bool:
