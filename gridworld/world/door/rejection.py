@@ -67,7 +67,7 @@ class Rejecting(Branching):
 
     Args:
         where: what messages call the environment.
-        everything: a copy of all attributes and of what it is given.
+        everything: a copy of all attributes and of what it is given, and whether it is the same in each run.
         runs: the code of the functions that run a reset or a step.
         remembers: whether what follows a draw in a loop is found once, wherever the same comes again.
         compares: whether shares are compared with real draws.
@@ -76,7 +76,7 @@ class Rejecting(Branching):
     def __init__(
         self,
         where: str,
-        everything: Callable[..., bytes],
+        everything: Callable[..., tuple[bytes, bool]],
         runs: Iterable[CodeType],
         remembers: bool = False,
         compares: bool = True,
@@ -88,15 +88,14 @@ class Rejecting(Branching):
         self._met: dict[Any, Way] = {}  # of each draw in a loop, the way to it
         # Whether a draw that was met on another way counts as having come again, where a loop begins anew.
         self._across = False
-        self._seen, self._head = (
-            set[Any](),
-            None,
-        )  # where this run has drawn; the first place where it did twice
         self.sampling: np.random.Generator | None = None  # draws, in place of taking every outcome
         self._takes_all = False  # no draw counts as a rejection
         self._compared: Counter[Any] = Counter()
         self._remembers = remembers
         self._known: dict[Any, dict[Any, Fraction]] = {}  # what follows a draw, if it remembers
+        # Of the draws of this run, with the ways to them, and whether they are the same in each run.
+        self._places: list[tuple[Any, Way, bool]] = []
+        self._is_lasting = True
 
     @contextmanager
     def drawing(self, numbers: np.random.Generator) -> Iterator[None]:
@@ -150,32 +149,44 @@ class Rejecting(Branching):
             return error.place
 
     def _ran(self, step: Callable[[], Result]) -> Result:
-        self._depth, self._seen, self._head = 0, set(), None
+        self._depth = self._num_drawn = 0
         return super()._ran(step)
 
     def drawn(self, name: str, *arguments: Any, **options: Any) -> Any:
         """A draw that the environment makes."""
         if self.sampling is not None:
             return getattr(self.sampling, name)(*arguments, **options)
-        if not self._depth and not self._takes_all and (place := self._place_of(name)) is not None:
-            way = self._place, tuple(self._taken[: self._place])
-            if place in self._known:
-                raise _Again(place, way)
-            if self._head is None and place[0] in self._seen:
-                self._head = place[0]
-            self._seen.add(place[0])
-            met, may_be = self._met.setdefault(place, way), self._across and place[0] == self._head
-            if met != way and (may_be or way[1][: met[0]] == met[1]):
-                raise _Again(place, met)
-            self._met[place] = way
+        if not self._depth and not self._takes_all:
+            number, self._num_drawn = self._num_drawn, self._num_drawn + 1
+            is_as_before = self._place < len(self._decisions) and number < len(self._places)
+            if not (is_as_before and self._places[number][2]):
+                way = self._place, tuple(self._taken[: self._place])
+                self._places[number:] = [(self._place_of(name), way, self._is_lasting)]
+                self._check_again(*self._places[-1])
+            place, way, _ = self._places[number]
+            if place is not None:
+                self._met[place] = way
         self._depth += 1
         try:
             return getattr(Branching, name)(self, *arguments, **options)
         finally:
             self._depth -= 1
 
+    def _check_again(self, place: Any, way: Way, _: bool) -> None:
+        """Raise `_Again` if it is known what follows a draw that is made now."""
+        if place is None:
+            return
+        if place in self._known:
+            raise _Again(place, way)
+        lines = [each[0] for each, *_ in self._places if each is not None]
+        head = next((line for number, line in enumerate(lines) if line in lines[:number]), None)
+        met, may_be = self._met.get(place, way), self._across and place[0] == head
+        if met != way and (may_be or way[1][: met[0]] == met[1]):
+            raise _Again(place, met)
+
     def _place_of(self, name: str) -> Any:
         """All that what follows a draw depends on; None where that cannot be seen."""
+        self._is_lasting = True
         frame: FrameType | None = sys._getframe(1)
         while frame is not None and frame.f_code.co_filename in OURS:
             frame = frame.f_back
@@ -195,7 +206,8 @@ class Rejecting(Branching):
             held.append(variables)
             name = code.co_name
         try:
-            return tuple(places), self._everything(*held)
+            content, self._is_lasting = self._everything(*held)
+            return tuple(places), content
         except Exception:  # whatever cannot be copied
             return None
 

@@ -185,11 +185,14 @@ class Search:
         continuous = "its states are continuous: only finite worlds have an exact optimum"
         return self.refusal(f"{continuous} ({str(error).partition(': ')[2]})")
 
-    def _everything(self, *held: Any) -> bytes:
-        """All that a step's rest depends on, with what the functions between hold."""
+    def _everything(self, *held: Any) -> tuple[bytes, bool]:
+        """All that a step's rest depends on, with what the functions between hold; is it all by content?"""
+        num_kept = len(self.layers.fixed)  # objects that are kept as they are, which a run may make anew
         if self._read is None:
-            return self.layers.everything(*held)
-        return self.layers.dump((self._read(self.layers.base), held))
+            found = self.layers.everything(*held)
+        else:
+            found = self.layers.dump((self._read(self.layers.base), held))
+        return found, len(self.layers.fixed) == num_kept
 
     def _explore(self) -> None:
         self.states: list[State] = []
