@@ -68,12 +68,7 @@ class Layers:
     """
 
     def __init__(
-        self,
-        where: str,
-        env: Env,
-        branching: Any,
-        keeps_shared: bool = True,
-        keeps_views: bool = False,
+        self, where: str, env: Env, branching: Any, keeps_shared: bool = True, keeps_views: bool = False
     ) -> None:
         self._where, self.branching, self.keeps_views = where, branching, keeps_views
         self.layers: list[Any] = []
@@ -134,8 +129,7 @@ class Layers:
         ):
             raise InputError(
                 f"{self._where}: it draws from another generator than self.np_random (numpy's or "
-                "Python's own), "
-                "so its outcomes cannot be enumerated; draw from self.np_random"
+                "Python's own), so its outcomes cannot be enumerated; draw from self.np_random"
             )
 
     def _adopt(self) -> None:
@@ -377,19 +371,15 @@ class Layers:
         if kind is Uniform:
             return "drawn", *thing.parts()
         if kind is Unread:
-            return (
-                self._keep(thing.counter.blank)
-                if not self._compares_forms
-                else (*thing.counter.key, thing.form)
-            )
+            counter = thing.counter
+            return (*counter.key, thing.form) if self._compares_forms else self._keep(counter.blank)
         if isinstance(thing, KEPT) or known.is_kept(kind):
             return self._keep(thing)
         if isinstance(thing, np.random.Generator):
             if not self.is_adopting:
                 raise InputError(
                     f"{self._where}: reset() or step() makes another np_random, whose draws cannot be "
-                    "enumerated; "
-                    "draw from self.np_random, and leave seeding to super().reset(seed=seed)"
+                    "enumerated; draw from self.np_random, and leave seeding to super().reset(seed=seed)"
                 )
             return id(self.branching)
         if isinstance(thing, np.random.RandomState | random.Random):
