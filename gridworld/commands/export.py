@@ -1,4 +1,4 @@
-"""Export finished runs to Weights & Biases, MLflow, or a folder for the Hugging Face Hub.
+"""Export finished runs to Weights & Biases, MLflow, the Hugging Face Hub, or their worlds to Storm.
 
 RUNS are folders of runs or sweeps, or any above them. Nothing is uploaded by default: W&B writes offline runs
 (unless WANDB_MODE is set), MLflow a local database (unless MLFLOW_TRACKING_URI is set). Runs exported before
@@ -76,7 +76,7 @@ def _export(folder: Path, to: str, out: Path, project: str) -> tuple[str, tuple[
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("export", __doc__, "runs", example="runs/mine --to hub")
     option = parser.add_argument
-    option("--to", choices=tuple(TARGETS), required=True, help="all but hub need the extra of the same name")
+    option("--to", choices=tuple(TARGETS), required=True, help="wandb and mlflow need the extra of that name")
     option("--out", type=Path, help="the folder to write to (default runs/export/TARGET)")
     option("--project", default="gridworld", help="W&B's project, MLflow's experiment (default: gridworld)")
     return parser

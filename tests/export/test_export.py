@@ -24,6 +24,9 @@ from gridworld.base.errors import InputError
 from gridworld.base.safe_read import sealed
 from gridworld.commands import export
 from gridworld.report.export.exported_run import read
+from gridworld.world.grid import compile_mdp
+from gridworld.world.layout import parse
+from gridworld.world.sources.storm import drn_lines
 
 NAME, TABLE = "dqn-classic-seed0", "q_learning-classic-seed3"
 
@@ -397,6 +400,52 @@ def test_the_hub_gets_the_tables_of_the_run_and_nothing_of_one_that_was_changed(
     export.main([str(lake), "--to", "hub", "--out", "hub"])
     [world] = (tmp_path / "hub").glob("*/world.npz")
     assert world.read_bytes() == (lake / "world.npz").read_bytes()
+
+
+def test_storm(lake: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    export.main([str(lake), "--to", "storm", "--out", "storm"])
+    [file] = Path("storm").glob("*.drn")
+    head, model = file.read_text().split("@model\n")
+    assert head.startswith("@type: MDP\n")
+    counts = [int(line) for line in head.splitlines() if line.isdigit()]
+    labels: list[list[str]] = []
+    rows: list[list[tuple[float, list[tuple[int, float]]]]] = []
+    for words in map(str.split, model.splitlines()):
+        if words[0] == "state":
+            assert int(words[1]) == len(labels)
+            labels.append(words[2:])
+            rows.append([])
+        elif words[0] == "action":
+            rows[-1].append((float(words[2].strip("[]")), []))
+        else:
+            rows[-1][-1][1].append((int(words[0]), float(words[2])))
+    assert counts == [len(rows), sum(map(len, rows))] == [16, 64]
+    assert labels[0] == ["init"]
+    assert labels[15] == ["goal", "over"]
+    assert labels[5] == ["trap", "over"]
+    values = [0.0] * len(rows)
+    for _ in range(3000):
+        values = [
+            max(paid + 0.99 * sum(chance * values[there] for there, chance in leads) for paid, leads in row)
+            for row in rows
+        ]
+    assert all(sum(chance for _, chance in leads) == pytest.approx(1) for row in rows for _, leads in row)
+    assert values[0] == pytest.approx(0.99**5)  # without slip: six steps
+
+
+@pytest.mark.parametrize("starts", [1, 3])
+def test_several_starts_are_a_state_of_their_own_in_storm(starts: int) -> None:
+    mdp = compile_mdp(parse("S" * starts + "...G", "map"))
+    lines = "".join(drn_lines(mdp)).splitlines()
+    begins = [n for n, line in enumerate(lines) if line.startswith("state") and " init" in line]
+    if starts == 1:
+        assert [lines[n] for n in begins] == ["state 0 init"]
+    else:
+        assert lines[begins[0] :] == [
+            *("state 7 init", "\taction begin [0]"),
+            *(f"\t\t{start} : {1 / 3!r}" for start in range(3)),
+        ]
 
 
 @pytest.mark.parametrize("to", ["wandb", "mlflow"])

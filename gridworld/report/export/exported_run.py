@@ -22,10 +22,9 @@ from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig
 from gridworld.report.evidence import Evidence, Unusable
 from gridworld.report.evidence import read as read_evidence
-from gridworld.run.folder import WORLD
 from gridworld.run.reader import LARGEST_RESULT, ONLINE, RunReader, open_run, read_columns, stored_world
+from gridworld.world.mdp import Mdp
 from gridworld.world.metrics import METRICS
-from gridworld.world.sources.arrays import world_bytes
 
 _LARGEST_PICTURE = 64 * 2**20  # bytes
 _COLUMNS = (*(f"{whose}{metric.name}" for whose in ("", "sampled_") for metric in METRICS), ONLINE)
@@ -44,7 +43,12 @@ class ExportedRun:
     curve: list[Row]  # one for each evaluation
     models: tuple[Path, ...]  # copies: of the last one, and of the best one
     pictures: tuple[Path, ...]  # copies of the pictures and films that the manifest has
-    world: Path | None  # a copy of its tables; None: it is a map
+    mdp: Mdp  # its world
+
+    @property
+    def is_map(self) -> bool:
+        """Whether its world is a map."""
+        return isinstance(self.config.env, MapConfig)
 
     @property
     def env(self) -> str:
@@ -81,10 +85,6 @@ def read(folder: Path, copies: Path) -> ExportedRun:
         copy.write_bytes(run.read(path, most))
         return copy
 
-    world = None
-    if not isinstance(config.env, MapConfig):
-        world = copies / WORLD
-        world.write_bytes(world_bytes(stored_world(run, config.env)))
     pictures = [run.folder / name for name in run.pictures() if os.path.lexists(run.folder / name)]
     return ExportedRun(
         identity=sha256(repr(sorted(sums.items())).encode())[:16],
@@ -94,7 +94,7 @@ def read(folder: Path, copies: Path) -> ExportedRun:
         curve=_curve(run),
         models=tuple(copied(path, LARGEST_RESULT) for path in (run.model_file, run.best_model_file)),
         pictures=tuple(copied(path, _LARGEST_PICTURE) for path in pictures),
-        world=world,
+        mdp=stored_world(run, config.env),
     )
 
 

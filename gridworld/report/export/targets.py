@@ -33,6 +33,8 @@ from gridworld.report.export.exported_run import ExportedRun
 from gridworld.report.tables import Table, to_markdown
 from gridworld.run.folder import WORLD
 from gridworld.world.metrics import METRICS
+from gridworld.world.sources.arrays import world_bytes
+from gridworld.world.sources.storm import drn_lines
 
 # What W&B would note of the process that exports would read as if it were of the run.
 _UNSAID = [
@@ -182,14 +184,22 @@ def to_hub(run: ExportedRun, out: Path, project: str) -> str:
         for path in run.pictures:
             shutil.copyfile(path, new / _shown_as(path))
         write_text(new / "README.md", card)
-        if run.world is None:
+        if run.is_map:
             write_text(new / "map.txt", run.evidence.layout + "\n")
         else:
-            shutil.copyfile(run.world, new / WORLD)
+            write_bytes(new / WORLD, world_bytes(run.mdp))
         write_json(new / "config.json", dataclasses.asdict(run.config))
         exact = {"is_deterministic": True, "is_exact": True, "run": run.identity}
         write_json(new / _RESULTS, {**run.summary, **_sb3_scores(run), **exact})
     return str(folder)
+
+
+def to_storm(run: ExportedRun, out: Path, project: str) -> str:
+    """Write the world of a run, named for it and its tables, as Storm reads it; returns the file."""
+    file = out / f"{run.env}-{run.mdp.digest()[:8]}.drn"
+    if not file.exists():
+        write_text(file, "".join(drn_lines(run.mdp)))
+    return str(file)
 
 
 def _shown_as(path: Path) -> str:
@@ -247,7 +257,7 @@ def _world(env: EnvConfig) -> str:
 
 
 def _metadata(run: ExportedRun, is_sb3: bool) -> dict[str, Any]:
-    world = ENV_ID if run.world is None else run.config.env.name
+    world = ENV_ID if run.is_map else run.config.env.name
     library = {"library_name": "stable-baselines3"} if is_sb3 else {}
     scores = [
         {"type": name, "name": f"{name} (exact)", "value": score, "verified": False}
@@ -276,6 +286,7 @@ TARGETS = {
     "wandb": Target(to_wandb, "wandb sync {out}/wandb/offline-run-*", ("wandb",)),
     "mlflow": Target(to_mlflow, _MLFLOW_UI, ("mlflow", "sqlalchemy", "alembic")),
     "hub": Target(to_hub, "hf upload USER/MODEL {place}"),
+    "storm": Target(to_storm, "storm --explicit-drn {place} --prop 'R{{\"reward\"}}max=? [Cdiscount=0.99]'"),
 }
 
 
