@@ -23,13 +23,13 @@ import numpy as np
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, steps_to
 
 NOTHING = 1e-290  # a value that has faded so far is 0: the smallest numbers of all never get smaller
-_ROUNDING = 1e-15  # relative to the largest value of a level: less than that is no change
 ACCURATE = 1e-13  # a relative change that adds up to little on the longest ways
 SWEPT_STATES = 20_000  # beyond, sweeps are faster than the factors of a sparse matrix
 SWEPT_GAMMA = 0.999  # up to here changes that small mean errors that small
 _LEAST = 64  # states of a level; smaller ones take as long, and are one with the next
 _COMPARED = 8  # of so many sweeps, one compares all actions
-_MOST_SWEEPS = 2_000
+_ROUNDING = 1e-15  # relative to the largest value of a level: less than that is no change
+MOST_SWEEPS = 2_000
 
 
 class NotConvergedError(ArithmeticError):
@@ -44,9 +44,8 @@ class Levels:
         steps[steps < 0] = steps.max() + 1
         live = np.flatnonzero(~mdp.absorbing)
         self._order: IntArray = live[np.argsort(steps[live], kind="stable")]
-        self._rank = np.full(
-            mdp.num_states, len(live), dtype=np.int32
-        )  # what is over is one, behind the last
+        # Where an episode is over is one, behind the last.
+        self._rank = np.full(mdp.num_states, len(live), dtype=np.int32)
         self._rank[self._order] = np.arange(len(live))
         self._num_states = mdp.num_states
         self._following = self._rank[mdp.next_state[self._order]]  # (n, A, K)
@@ -67,9 +66,9 @@ class Levels:
         order = np.argsort(read, kind="stable")
         return np.split(reader[order], np.searchsorted(read[order], np.arange(1, count + 1)))
 
-    def optimum(self, gamma: float, tolerance: float) -> FloatArray:
+    def optimum(self, gamma: float, tolerance: float, most: int) -> FloatArray:
         """V* (S,), by sweeps from 0; see `_swept`."""
-        return self._swept(self._following, gamma * self._probability, self._paid, None, tolerance)
+        return self._swept(self._following, gamma * self._probability, self._paid, None, tolerance, most)
 
     def sums(
         self, transition: Any, paid: FloatArray, near: FloatArray, gamma: float, tolerance: float
@@ -84,9 +83,8 @@ class Levels:
         following = np.zeros((len(counts), counts.max()), dtype=np.int32)
         weight = np.zeros(following.shape)
         following[place], weight[place] = self._rank[ordered.indices], gamma * ordered.data
-        return self._swept(
-            following[:, None], weight[:, None], paid[self._order][:, None], near[self._order], tolerance
-        )
+        paid, near = paid[self._order][:, None], near[self._order]
+        return self._swept(following[:, None], weight[:, None], paid, near, tolerance, MOST_SWEEPS)
 
     def _swept(
         self,
@@ -95,6 +93,7 @@ class Levels:
         paid: FloatArray,
         near: FloatArray | None,
         tolerance: float,
+        most: int,
     ) -> FloatArray:
         """x (S,) with x(s) = max_a [ paid(s, a) + Σ_k weight(s, a, k) x(following(s, a, k)) ].
 
@@ -104,6 +103,7 @@ class Levels:
             paid: (n, A).
             near: (n,), where to begin; None: at 0.
             tolerance: the relative change of a level that those who read it need not know of.
+            most: sweeps of all states, or as many of some.
 
         Raises:
             NotConvergedError: values still change by more than that.
@@ -118,7 +118,7 @@ class Levels:
         moved = [0.0] * num_levels  # by how much no reader knows
         flags = bytearray(b"\1" * num_levels)
         waiting = np.frombuffer(flags, dtype=np.uint8)
-        left = _MOST_SWEEPS * len(paid)
+        left = most * len(paid)
         while (level := flags.find(1)) >= 0:
             if left < 0:
                 raise NotConvergedError(self._of_states(x))
@@ -134,9 +134,9 @@ class Levels:
                     follows[part], weighs[part], pays[part] = following[best], weight[best], paid[best]
                     new, known[level] = q.max(axis=1), 1
                 size = np.abs(new)
-                change = np.abs(new - x[part]) / (size + _ROUNDING * size.max() + NOTHING)
+                change = np.abs(new - x[part]) / (size + _ROUNDING * size.max(initial=0.0) + NOTHING)
                 x[part] = new
-                moved[level] += float(change.max())
+                moved[level] += float(change.max(initial=0.0))
                 left -= len(new)
                 if moved[level] > tolerance:
                     moved[level] = 0.0

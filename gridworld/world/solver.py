@@ -43,6 +43,7 @@ from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup, st
 # Two actions whose values agree to this relative precision are equally good. Rounding stays far below it.
 TIE = 1e-9
 _SWEEP_TOLERANCE = 1e-9  # sweeps need only find a good policy; the rest is solved exactly
+_SWEEPS = 200
 _IMPROVEMENT = 1e-11  # relative; less than that is rounding
 _PATIENT = 100.0  # steps; a longer horizon, 1 / (1 - γ), adds up more of what counts as a tie in one step
 _MOST_SOLUTIONS = 8  # of a world that are kept
@@ -75,15 +76,13 @@ def value_iteration(mdp: Mdp, gamma: float) -> Solution:
     """
     gamma = check_gamma(gamma)
     ordinary = min(gamma, ORDINARY_GAMMA)
-    is_accurate = levels.are_enough(mdp, gamma)
     try:
-        swept = levels.of(mdp).optimum(ordinary, levels.ACCURATE if is_accurate else _SWEEP_TOLERANCE)
+        if levels.are_enough(mdp, gamma):
+            return _solve_by_sweeps(mdp, gamma)
+        swept = levels.of(mdp).optimum(ordinary, _SWEEP_TOLERANCE, _SWEEPS)
     except levels.NotConvergedError as most:
-        swept, is_accurate = most.args[0], False
-    q = backup(mdp, swept, ordinary)
-    greedy: IntArray = np.argmax(q, axis=1)
-    if is_accurate:
-        return _solution(mdp, gamma, swept, q, _scale(mdp, gamma, greedy, np.abs(swept)))
+        swept = most.args[0]
+    greedy: IntArray = np.argmax(backup(mdp, swept, ordinary), axis=1)
     if gamma <= ORDINARY_GAMMA:
         return _solve_discounted(mdp, gamma, greedy)
     if gamma == 1:
@@ -136,11 +135,13 @@ def _precision(gamma: float) -> float:
     return min(1.0, _PATIENT * (1 - gamma))
 
 
-def _scale(mdp: Mdp, gamma: float, actions: IntArray, near: FloatArray) -> FloatArray:
-    """(S,), the expected discounted sum of |reward| of a policy (S,) in a large world."""
-    paid = pick(np.einsum("sak,sak->sa", mdp.probability, np.abs(mdp.reward)), actions)
-    transition = Chain(mdp, one_hot_policy(actions, mdp.num_actions)).transition
-    return levels.of(mdp).sums(transition, paid, near, gamma, TIE)
+def _solve_by_sweeps(mdp: Mdp, gamma: float) -> Solution:
+    v = levels.of(mdp).optimum(gamma, levels.ACCURATE, levels.MOST_SWEEPS)
+    q = backup(mdp, v, gamma)
+    greedy = np.argmax(q, axis=1)
+    paid = pick(np.einsum("sak,sak->sa", mdp.probability, np.abs(mdp.reward)), greedy)
+    transition = Chain(mdp, one_hot_policy(greedy, mdp.num_actions)).transition
+    return _solution(mdp, gamma, v, q, levels.of(mdp).sums(transition, paid, np.abs(v), gamma, TIE))
 
 
 def _solve_by_value_and_slope(mdp: Mdp, gamma: float, greedy: IntArray) -> tuple[Evaluation, BoolArray]:

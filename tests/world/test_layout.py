@@ -205,7 +205,7 @@ def test_the_shipped_layouts_load_before_files(tmp_path, monkeypatch):
     [
         *[(rows, 6) for rows in (3, 0, -5, 5.0, "5", True, None, float("nan"))],
         *[(5, cols) for cols in (2, 0, 6.5)],
-        (600, 600),
+        (1100, 1100),
     ],
 )
 def test_classic_refuses_what_cannot_hold_it(num_rows, num_cols):

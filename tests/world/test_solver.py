@@ -185,7 +185,7 @@ def test_where_sweeps_do_not_come_to_an_end_factors_are_taken_or_the_world_is_re
     mdp = made("\n".join(["S" + "." * 29, *["." * 30] * 28, "." * 29 + "G"]), slip=0.5)
     expected = solve.value_iteration(mdp, 0.99)
     monkeypatch.setattr(levels, "SWEPT_STATES", 0)
-    monkeypatch.setattr(levels, "_MOST_SWEEPS", 3)
+    monkeypatch.setattr(levels, "MOST_SWEEPS", 3)
     assert solve.value_iteration(mdp, 0.99).v == pytest.approx(expected.v, rel=1e-11)
     monkeypatch.setattr(chain, "_MOST_FACTORED", 800)
     with pytest.raises(InputError, match=r"map: 899 states are too many for gamma=0.99; more than 800 need"):
