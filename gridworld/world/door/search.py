@@ -143,12 +143,11 @@ class Search:
                 changing.update(each for each in before | after if before.get(each) != after.get(each))
 
             as_sent = walk(self, np.int64, look)
-            layers.put(self.begin)
-            if walk(self, int) != as_sent:
+            for kind, mistake in ((np.int64, _NOT_REPEATED), (int, _INTS)):
                 layers.put(self.begin)
-                is_repeated = walk(self, np.int64) == as_sent
-                layers.check_generators()
-                raise self.refusal(_INTS if is_repeated else _NOT_REPEATED)
+                if walk(self, kind) != as_sent:
+                    layers.check_generators()
+                    raise self.refusal(mistake)
             while True:
                 layers.put(self.begin)
                 layers.leave(changing, series)
