@@ -113,7 +113,7 @@ def test_a_world_is_worth_what_a_walk_with_flags_is(table, seed):
 @pytest.mark.parametrize(
     ("shape", "told"),
     [
-        ((600_000, 2, 1), "600,000 states and 2 actions are too many"),
+        ((1_100_000, 2, 1), "1,100,000 states and 2 actions are too many"),
         ((100_000, 100, 20), r"would take [\d.]+ GiB of memory; at most 4 GiB"),
     ],
 )

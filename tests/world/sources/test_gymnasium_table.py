@@ -236,7 +236,7 @@ ROW = [(1.0, 0, 0.0, False)]
         ({"start": None}, "start must be the 2 probabilities"),
         ({"start": 2}, "start must be the 2 probabilities"),
         ({"P": {}}, "start must be the 0 probabilities"),
-        ({"P": [[ROW]] * 10**6}, "1,000,000 states and 1 actions are too many"),
+        ({"P": [[ROW]] * 1_100_000}, "1,100,000 states and 1 actions are too many"),
     ],
 )
 def test_a_table_that_is_none_is_refused(changed, told):
