@@ -369,6 +369,28 @@ def test_a_search_of_one_worker_is_the_same_however_it_was_stopped(
     assert searched("killed", killed) == calm
 
 
+def test_after_a_kill_that_left_gaps_no_trial_is_drawn_twice(tmp_path: Path) -> None:
+    """Of four trials at once the last one has ended; the first, the baseline, runs again."""
+
+    class Killed(Inline):
+        def run(self, tasks: Any, ended: Any = None, tick: Any = None, answer: Any = None) -> None:
+            (last,) = itertools.islice(tasks, 3, 4)
+            ended(last, [outcome(0.5)])
+            raise KeyboardInterrupt
+
+    words = ("tune.trials=6", "tune.sampler=random", "tune.workers=4", "tune.together=1")
+    spec, study = asked(tmp_path, *words)
+    with contextlib.suppress(KeyboardInterrupt):
+        search(spec, study, Killed(lambda *_: None))
+    spec, study = asked(tmp_path, *words)
+    search(spec, study, Inline(lambda *_: outcome(0.25)))
+    assert len({str(trial.params) for trial in study.trials}) == 6
+    assert [trial.params == spec.space.parameters_of(spec.base) for trial in study.trials[:2]] == [
+        False,
+        True,
+    ]
+
+
 def told(trial: FrozenTrial) -> tuple[Any, ...]:
     return trial.state, trial.params, trial.values, trial.intermediate_values, trial.user_attrs.get("seeds")
 

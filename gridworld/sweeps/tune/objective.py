@@ -42,7 +42,7 @@ from gridworld.training.setup import check_settings, make_context
 from gridworld.training.together import Training, run_together
 from gridworld.world.evaluation import Evaluator
 
-SEEDS, ERROR, WORKER, DRAW = "seeds", "error", "worker", "draw"  # attributes of a trial in the study
+SEEDS, ERROR, WORKER = "seeds", "error", "worker"  # attributes of a trial in the study
 FINAL = "final "  # what attributes of the study begin with that are finalists' runs
 
 Values = Mapping[str, Any]  # {"agent.learning_rate": 0.01, ...}

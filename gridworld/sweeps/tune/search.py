@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import itertools
 import json
 import math
 import os
@@ -38,7 +37,6 @@ from gridworld.report.tuning_study import TRIALS_CSV
 from gridworld.run.folder import shell_path
 from gridworld.sweeps.folder import one_line
 from gridworld.sweeps.tune.objective import (
-    DRAW,
     ERROR,
     FINAL,
     SEEDS,
@@ -147,7 +145,6 @@ def _check_readable(study: optuna.Study, space: SearchSpace) -> None:
         raise ValueError("it does not minimise")
     for trial in study.get_trials(deepcopy=False):
         scratch.add_trial(trial)  # which validates it
-        int(trial.user_attrs.get(DRAW, 0))
         seeds = [read_score(seed) for seed in trial.user_attrs.get(SEEDS, [])]
         if trial.state != TrialState.FAIL and trial.distributions != space.distributions:
             raise ValueError(f"trial {trial.number} belongs to another search space")
@@ -220,34 +217,33 @@ class Search:
     def __init__(self, spec: StudySpec, study: optuna.Study) -> None:
         self.running: dict[int, optuna.Trial] = {}
         self._spec, self._settings, self._study = spec, spec.settings, study
-        self._objective, self._first = spec.objective, spec.space.parameters_of(spec.base)
+        self._objective = spec.objective
         self._deadline = time.monotonic() + (spec.settings.timeout or math.inf)
         self._memory = optuna.create_study(study_name=study.study_name, pruner=self._pruner())
         before = study.get_trials(deepcopy=False)
         self._memory.add_trials(before)
+        if (first := spec.space.parameters_of(spec.base)) is not None:
+            self._memory.enqueue_trial(first, skip_if_exists=True)
         self._seen = len(before)  # trials of the study that are in memory
         self._name = f"{socket.gethostname()}:{os.getpid()}"
-        self._stream = uuid.uuid4().hex if spec.settings.storage else ""
+        # Another one where the next number may have been drawn: elsewhere, or before a kill that left gaps.
+        is_at_once = (spec.settings.workers, spec.settings.together) != (1, 1)
+        self._stream = uuid.uuid4().hex if spec.settings.storage or (before and is_at_once) else ""
 
     def next(self) -> Trials | None:
         """As many trials as train at once, or are missing."""
         begun: dict[int, tuple[Values, tuple[int, ...]]] = {}
         while len(begun) < (self._settings.together or 1) and time.monotonic() < self._deadline:
             ended = self._study.get_trials(deepcopy=False)
-            if len(ended) + len(self.running) >= self._settings.trials:
+            draw = len(ended) + len(self.running)
+            if draw >= self._settings.trials:
                 break
             for trial in ended[self._seen :]:
                 if trial.user_attrs.get(WORKER) != self._name:  # it is of another process or machine
                     self._memory.add_trial(trial)
             self._seen = len(ended)
-            taken = {int(trial.user_attrs.get(DRAW, trial.number)) for trial in ended}
-            taken |= {running.user_attrs[DRAW] for running in self.running.values()}
-            draw = next(number for number in itertools.count() if number not in taken)
-            if draw == 0 and self._first is not None:
-                self._memory.enqueue_trial(self._first)
             self._memory.sampler = self._sampler(draw)
             new = self._memory.ask(self._spec.space.distributions)
-            new.set_user_attr(DRAW, draw)
             new.set_user_attr(WORKER, self._name)
             begun[new.number] = self._spec.space.values(new.params), self._objective.seeds
             self.running[new.number] = new
@@ -272,11 +268,7 @@ class Search:
             self._study.add_trial(self._memory.tell(trial, outcome.value, state))
 
     def _sampler(self, draw: int) -> optuna.samplers.BaseSampler:
-        """Give a draw a random stream of its own, whenever it is drawn.
-
-        So one worker's study is the same whether it was interrupted or not. Commands that share a database
-        differ in theirs, or they would draw the same trials.
-        """
+        """With a random stream of the draw's: one worker's study is the same whether interrupted or not."""
         seed = zlib.crc32(repr((self._settings.sampler_seed, draw, self._stream)).encode())
         if self._settings.sampler == "random":
             return optuna.samplers.RandomSampler(seed=seed)
