@@ -16,15 +16,7 @@ from gridworld.base.errors import InputError
 from gridworld.config.train import check_bounds
 from gridworld.config.worlds import schema_of
 from gridworld.report import statistics
-from gridworld.report.evidence import (
-    DAMAGED,
-    REPORTED,
-    SAMPLED_RETURN,
-    Evidence,
-    Unusable,
-    find_runs,
-    read,
-)
+from gridworld.report.evidence import DAMAGED, REPORTED, SAMPLED_RETURN, Evidence, Unusable, find_runs, read
 from gridworld.report.grouping import Group, Study, arrange
 from gridworld.report.playground.page import fits, link
 from gridworld.report.statistics import Interval, Share

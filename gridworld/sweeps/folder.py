@@ -20,25 +20,11 @@ from pathlib import Path, PurePath
 from types import MappingProxyType
 from typing import Any
 
-from gridworld.base.atomic_write import (
-    check_no_links,
-    is_locked,
-    make_folder,
-    write_json,
-    write_text,
-)
+from gridworld.base.atomic_write import check_no_links, is_locked, make_folder, write_json, write_text
 from gridworld.base.console import recorded_command_line
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import LARGEST_JSON, csv_text, read_bytes, read_sealed, sealed
-from gridworld.run.folder import (
-    ERROR_FILE,
-    HYDRA,
-    LOCK,
-    MANIFEST,
-    SWEEP_JSON,
-    alone_in,
-    check_writable,
-)
+from gridworld.run.folder import ERROR_FILE, HYDRA, LOCK, MANIFEST, SWEEP_JSON, alone_in, check_writable
 from gridworld.run.provenance import settings_hash, versions
 from gridworld.run.reader import RunReader, check_is, find_run
 from gridworld.sweeps.plan import Job

@@ -29,13 +29,7 @@ import optuna
 from omegaconf import OmegaConf
 from optuna.trial import FrozenTrial, TrialState
 
-from gridworld.base.atomic_write import (
-    check_no_links,
-    inside,
-    is_locked,
-    write_json,
-    write_text,
-)
+from gridworld.base.atomic_write import check_no_links, inside, is_locked, write_json, write_text
 from gridworld.base.console import command, printable, recorded_command_line, tell
 from gridworld.base.errors import InputError
 from gridworld.base.processes import Processes, can_fork
