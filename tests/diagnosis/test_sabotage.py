@@ -15,10 +15,10 @@ import pytest
 from helpers.sabotage import CATALOGUE, HELD_OUT, MADE_ON, SOUND, Sabotage, random_map
 
 import gridworld
-from gridworld.agents.sb3.oracle_fit import one_state_fit
 from gridworld.agents.sb3.settings import SB3ClassConfig
 from gridworld.diagnosis.causes import PHRASES
 from gridworld.diagnosis.causes.implementation import of_library
+from gridworld.diagnosis.oracle_fit import one_state_fit
 from gridworld.diagnosis.verdict import Diagnosis
 from gridworld.world.solver import solved
 

@@ -15,7 +15,7 @@ from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import IntArray
 
 if TYPE_CHECKING:
-    from gridworld.agents.sb3.oracle_fit import OneState
+    from gridworld.diagnosis.oracle_fit import OneState
 
 _FEW = 4  # transitions of a state in a replay buffer
 _OFTEN = 10  # times as many visits
@@ -82,7 +82,7 @@ def _bottleneck(run: Evidence) -> int:
     """
     if run.config.agent.family != "sb3":
         return 0
-    from gridworld.agents.sb3.oracle_fit import narrowest_layer  # imports torch
+    from gridworld.diagnosis.oracle_fit import narrowest_layer  # imports torch
 
     units, states = narrowest_layer(run.agent), np.flatnonzero(run.mdp.acting)
     if not units or units >= run.mdp.num_actions or not np.isfinite(run.own.q[states]).all():
@@ -100,7 +100,7 @@ def _fits(run: Evidence, fresh: bool) -> bool | None:
     """Whether a network learns the exact optimum of its own objective; None: none, or too large to try."""
     if run.config.agent.family != "sb3" or run.own.gamma > 0.9999:  # where actions hardly differ
         return None
-    from gridworld.agents.sb3.oracle_fit import oracle_fit  # imports torch
+    from gridworld.diagnosis.oracle_fit import oracle_fit  # imports torch
 
     judge = Evaluator(run.mdp, run.own.gamma, 1)
 
@@ -112,6 +112,6 @@ def _fits(run: Evidence, fresh: bool) -> bool | None:
 
 def _alone(run: Evidence, state: int) -> OneState | None:
     """What comes of teaching its network one state only; None where that would take too long."""
-    from gridworld.agents.sb3.oracle_fit import one_state_fit  # imports torch
+    from gridworld.diagnosis.oracle_fit import one_state_fit  # imports torch
 
     return one_state_fit(run.agent, run.own, np.flatnonzero(run.mdp.acting), state)
