@@ -29,7 +29,7 @@ class SweepConfig:
 class ForksConfig:
     """`hydra/launcher=forks`, the default: populations in forks of the sweep's process, on Linux."""
 
-    _target_: str = "gridworld.sweeps.launchers.forks"
+    _target_: str = "gridworld.sweeps.launchers.forks"  # a name, as of the other launchers: not imported
     n_jobs: int = -1
 
 

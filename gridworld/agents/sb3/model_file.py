@@ -57,7 +57,7 @@ def read_model(path: Path, most: int, kind: str = "a model") -> tuple[Parameters
 
 
 def read_weights(path: Path, most: int) -> dict[str, NDArray[Any]]:
-    """See `gridworld.agents.Family.weights`; the optimiser's and the model's own numbers are among them."""
+    """See `config.train.AgentConfig.weights`; the optimiser's and the model's own numbers are among them."""
     parameters, numbers = read_model(path, most)
     own = {f"data.{name}": np.array(number) for name, number in numbers.items() if name != _CLOCK}
     return own | {

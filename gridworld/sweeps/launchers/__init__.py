@@ -1,4 +1,4 @@
-"""Where the populations of a sweep run: on this machine, or by one of the modules beside this one."""
+"""Where the populations of a sweep run: on this machine, or by one of the modules next to this one."""
 
 from __future__ import annotations
 
