@@ -80,7 +80,8 @@ class ForeignPolicy:
         self._masks = task.masks() if takes_masks else None
         self._is_known = is_of_libraries(model, policy)  # so that its network says how it explores
         self._check_statistics()
-        self._check_is_a_table(self._observation())
+        if (reason := why_unsteady(model, policy, self._observation(), task.mdp, self._masks)) is not None:
+            raise InputError(f"the model {reason}")
 
     def tables(self) -> Tables:
         """Ask it about every state. It is left as it was."""
@@ -159,11 +160,6 @@ class ForeignPolicy:
                     "trained under VecNormalize, give env=VecNormalize.load(FILE, batch)"
                 )
                 return
-
-    def _check_is_a_table(self, observation: ObservationTable) -> None:
-        asked = self._model, self._policy, observation, self._task.mdp, self._masks
-        if (reason := why_unsteady(*asked)) is not None:
-            raise InputError(f"the model {reason}")
 
 
 def _moments(normalizer: VecNormalize) -> FloatArray:

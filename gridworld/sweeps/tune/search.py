@@ -49,8 +49,7 @@ from gridworld.sweeps.tune.objective import (
 )
 from gridworld.sweeps.tune.study_spec import SearchSpace, StudySpec
 
-# Attributes of the study.
-ABOUT = "gridworld"  # what makes its trials comparable
+ABOUT = "gridworld"  # the study's attribute that says what makes its trials comparable
 
 _CONNECT_SECONDS = 10
 _LOCKED_SECONDS = 60  # to wait for others at an SQLite file

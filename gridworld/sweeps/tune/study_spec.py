@@ -213,7 +213,10 @@ class SearchSpace:
                 return error
             return None
 
-        extremes = {key: self._extremes(key) for key in self.dimensions}
+        extremes: dict[str, list[Any]] = {key: each.choices or [] for key, each in self.dimensions.items()}
+        for key, each in self.distributions.items():
+            if isinstance(each, FloatDistribution | IntDistribution):
+                extremes[key] = [each.low, each.high]
         rng = random.Random(0)
         alone = [{key: value} for key, values in extremes.items() for value in values]
         corners = ({key: rng.choice(values) for key, values in extremes.items()} for _ in range(_CORNERS))
@@ -222,12 +225,6 @@ class SearchSpace:
             found = mistake(values)
             if found and all(mistake(other | values) for other in others):
                 raise InputError(f"tune={self.name}: {found}")
-
-    def _extremes(self, key: str) -> list[Any]:
-        distribution = self.distributions[key]
-        if isinstance(distribution, FloatDistribution | IntDistribution):
-            return [distribution.low, distribution.high]
-        return self.dimensions[key].choices or []
 
     def values(self, parameters: Values) -> dict[str, Any]:
         """The values of a trial's parameters, which are as Optuna stores them."""
