@@ -12,7 +12,6 @@ import functools
 import io
 import logging
 import math
-import os
 import re
 import struct
 from collections.abc import Iterable, Iterator, Sequence
@@ -73,9 +72,7 @@ def check_out(folder: Path) -> None:
             )
     elif folder.exists():
         raise InputError(f"--out {folder}: is not a folder; choose a new one")
-    existing = next(parent for parent in folder.absolute().parents if parent.exists())
-    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
-        raise InputError(f"--out {folder}: {existing} is not writable; choose another folder")
+    check_writable(folder.absolute().parent, "--out")  # where the new one takes its place
 
 
 def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS) -> Path:

@@ -689,7 +689,7 @@ def test_only_a_report_is_replaced(
     for out, words in (
         ("mine", "holds thesis.tex, which is not part of a report"),
         ("file", "is not a folder"),
-        ("file/below", "is not writable"),
+        ("file/below", "file is a file; choose another --out"),
     ):
         with pytest.raises(InputError, match=words):
             command.main([str(tmp_path), "--out", str(tmp_path / out)])
