@@ -16,7 +16,6 @@ from gridworld.base.processes import LostError
 from gridworld.base.signals import handling
 from gridworld.sweeps.job import Worker
 from gridworld.sweeps.launchers import Launch, collect
-from gridworld.sweeps.plan import Job
 
 _ENDED_WITHIN = 1.0  # seconds
 
@@ -25,21 +24,18 @@ def run(launch: Launch, settings: Mapping[str, Any]) -> None:
     """Run populations; see `run_groups`."""
     _connect(settings["init"])
     remote = ray.remote(**settings["remote"]) if settings["remote"] else ray.remote
-    function, worker = remote(_run), ray.put(launch.worker)
-    tasks = {function.remote(worker, list(jobs)): jobs for jobs in launch.groups}
+    function, worker = remote(Worker.on_node), ray.put(launch.worker)
+    tasks = {function.remote(worker, [list(jobs)]): jobs for jobs in launch.groups}
     try:
-        collect(launch, tasks, _is_done, _result)
+        collect(launch, tasks, lambda task: not _wait_for([task], 0), _result)
     except BaseException:
-        _cancel(_wait_for(list(tasks), 0))
+        left = _wait_for(list(tasks), 0)
+        for task in left:
+            ray.cancel(task)
+        if left:
+            _wait_for(left, _ENDED_WITHIN)
+        print(f"ray: {len(left)} tasks cancelled", file=sys.stderr, flush=True)
         raise
-
-
-def _run(worker: Worker, jobs: list[Job]) -> list[str]:
-    return worker.on_node([jobs])
-
-
-def _is_done(task: Any) -> bool:
-    return not _wait_for([task], 0)
 
 
 def _result(task: Any) -> list[str]:
@@ -55,14 +51,6 @@ def _result(task: Any) -> list[str]:
 def _wait_for(tasks: list[Any], seconds: float) -> list[Any]:
     """The tasks that have not ended within so many seconds."""
     return list(ray.wait(tasks, num_returns=len(tasks), timeout=seconds)[1])
-
-
-def _cancel(tasks: list[Any]) -> None:
-    for task in tasks:
-        ray.cancel(task)
-    if tasks:
-        _wait_for(tasks, _ENDED_WITHIN)
-    print(f"ray: {len(tasks)} tasks cancelled", file=sys.stderr, flush=True)
 
 
 def _connect(arguments: dict[str, Any]) -> None:
