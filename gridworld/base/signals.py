@@ -151,7 +151,8 @@ class StopRequest:
                     signal.signal(number, handler)
 
     def obey(self) -> None:
-        """Stop here, by `Interrupted`, if a signal asked for it."""
+        """Stop here, by `Interrupted`, if a signal asked for it; one that comes later stops at once."""
+        self.patient = False
         if self.number is not None:
             raise Interrupted(self.number)
 

@@ -30,13 +30,13 @@ from gridworld.run.console import Summary
 from gridworld.run.folder import CHECKPOINTS, CURVE
 from gridworld.run.provenance import environment, git, identity, settings, source_differences
 from gridworld.run.reader import RunReader, read_run, stored_world
-from gridworld.run.writer import RunWriter, TrainLog
+from gridworld.run.writer import RunWriter
 from gridworld.training.learning_curve import CURVE_COLUMNS
 from gridworld.training.saved_run import settings_of
-from gridworld.training.session import CONTENT, FORMAT, LOGS, OnBuilt, ignore
+from gridworld.training.session import CONTENT, FORMAT, LOGS
 from gridworld.training.setup import check_settings
 from gridworld.training.together import Training, alone
-from gridworld.training.train import carry_out
+from gridworld.training.train import Beginning, OnBuilt, training
 from gridworld.world.mdp import Mdp
 
 _LONGEST_HEADER = 2**12  # bytes
@@ -89,14 +89,14 @@ class Unfinished:
         total_timesteps: int | None = None,
         anyway: bool = False,
         progress: bool = True,
-        on_built: OnBuilt = ignore,
+        on_built: OnBuilt = None,
     ) -> Training[Summary]:
         """Train to the end, which `total_timesteps` may set anew.
 
         `anyway` accepts an environment in which the last bits of the numbers may differ; progress is shown
         where the run's settings do so, too; `on_built` takes the agent before it learns.
         """
-        run, folder, old_total = self.run, self.run.folder, self.config.total_timesteps
+        folder, old_total = self.run.folder, self.config.total_timesteps
         total = old_total if total_timesteps is None else total_timesteps
         logging = self.config.logging
         config = dataclasses.replace(
@@ -104,20 +104,25 @@ class Unfinished:
             total_timesteps=total,
             logging=dataclasses.replace(logging, progress=logging.progress and progress),
         )
-        with TrainLog() as log:
-            if total_timesteps is None and run.is_finished and Checkpoints(folder).files():
-                raise InputError(
-                    f"{folder}: is finished; to make it longer:  {_resume_command(run)} "
-                    f"total_timesteps={2 * old_total}"
-                )
-            mdp = check_settings(config, lambda env: self.mdp)
-            self._tell_if_map_changed()
-            with telling_if_slow(f"reading the checkpoints of {folder}"):
-                state = _newest_state(run, identity(config, mdp.text()))
-            begin = partial(self._restart, config) if state is None else self._continue(config, state, anyway)
-            return (yield from carry_out(config, folder, mdp, begin, log, self.is_trusted, state, on_built))
+        if total_timesteps is None and self.run.is_finished and Checkpoints(folder).files():
+            raise InputError(
+                f"{folder}: is finished; to make it longer:  {_resume_command(self.run)} "
+                f"total_timesteps={2 * old_total}"
+            )
+        continued = partial(self._beginning, anyway)
+        overrides = self.run.manifest.get("overrides", [])
+        return training(config, folder, overrides, lambda env: self.mdp, on_built, self.is_trusted, continued)
 
     resume = alone(resumption)
+
+    def _beginning(self, anyway: bool, config: TrainConfig, mdp: Mdp) -> Beginning:
+        """The newest checkpoint's state, checked, and what writes the manifest; tells what differs."""
+        self._tell_if_map_changed()
+        with telling_if_slow(f"reading the checkpoints of {self.run.folder}"):
+            state = _newest_state(self.run, identity(config, mdp.text()))
+        if state is None:
+            return None, partial(self._restart, config)
+        return state, self._continue(config, state, anyway)
 
     def _restart(self, config: TrainConfig) -> RunWriter:
         """Start again, which a finished run is too good for."""

@@ -34,7 +34,7 @@ from gridworld.base import atomic_write as files
 from gridworld.base.atomic_write import AppendLog
 from gridworld.run import checkpoints as checkpoint
 from gridworld.run.checkpoints import Checkpoints
-from gridworld.training import session
+from gridworld.training import train
 from gridworld.training.pictures import Pictures
 
 KILLS = int(os.environ.get("GRIDWORLD_RUN_KILLS", "10"))
@@ -112,7 +112,7 @@ def test_a_run_that_dies_after_its_last_checkpoint_writes_the_same_model(case: s
     words = [*CASES.get(case, SHORT["value_iteration"]), "recording.frames=false", "recording.gif=false"]
     begin(tmp_path / "calm", *words)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(session.Session, "_finish", crash)
+        patched.setattr(train, "summarise", crash)
         with pytest.raises(Crash):
             begin(tmp_path / "run", *words)
     go_on(tmp_path / "run")
@@ -163,8 +163,8 @@ POINTS: list[tuple[Any, str, bool, int]] = [
     (files.os, "fsync", True, 7),
     (files, "sync_folder", False, 3),
     (Checkpoints, "keep", False, 4),
-    (session, "write_bytes", True, 1),
-    (session, "write_json", False, 1),
+    (train, "write_bytes", True, 1),
+    (train, "write_json", False, 1),
     (Pictures, "finish", False, 1),
 ]
 
