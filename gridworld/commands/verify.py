@@ -65,7 +65,7 @@ def _verified(folder: Path, options: argparse.Namespace) -> tuple[Verified, bool
         saved = SavedRun(folder, options.trust, options.best)
         evaluator = saved.evaluator()
         verified = proven(evaluator, saved.snapshot().greedy)
-    is_certified = bool(saved.run.read_summary().get("certified")) and not options.best
+    is_certified = saved.run.read_summary()["certified"] and not options.best
     mdp, gamma = evaluator.mdp, evaluator.solution.gamma
     shown = coloured(printable(str(verified)), verified.is_optimal)
     print(f"{printable(f'{folder} on {mdp.name}, discount {gamma:g}')}: {shown}")

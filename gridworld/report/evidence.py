@@ -55,6 +55,9 @@ class Evidence:
     layout: str  # the map's text
     gamma: float  # the evaluation's discount
     optimal_value: float  # of the optimal policy at the start
+    certified: bool  # whether the final greedy policy is optimal
+    certified_since_step: float  # of the certificate that still holds; infinite without one
+    first_certified_step: float
     seconds: float  # of training
     started: str  # the date
     version: str  # of this package; "?" where the manifest does not say
@@ -73,27 +76,9 @@ class Evidence:
         return int(self.curve["step"][-1])
 
     @property
-    def certified(self) -> bool:
-        """Whether the final greedy policy is optimal."""
-        return bool(self.curve["certified"][-1])
-
-    @property
     def regret(self) -> float:
         """The final greedy policy's regret; exactly 0 for a certified one, so that two of them are a tie."""
         return 0.0 if self.certified else round(float(self.curve["regret"][-1]), _DIGITS)
-
-    @property
-    def certified_since_step(self) -> float:
-        """Environment steps since which every evaluation is certified; infinite where the last one is not."""
-        lost = np.flatnonzero(self.curve["certified"] != 1)
-        since = int(lost[-1]) + 1 if len(lost) else 0
-        return float(self.curve["step"][since]) if since < len(self.curve["step"]) else math.inf
-
-    @property
-    def first_certified_step(self) -> float:
-        """Environment steps at the first certificate; infinite where there was none."""
-        hits = np.flatnonzero(self.curve["certified"])
-        return float(self.curve["step"][hits[0]]) if len(hits) else math.inf
 
 
 @dataclass(frozen=True)
@@ -183,11 +168,14 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
     if not isinstance(config.get("env"), dict):
         raise InputError(f"{where}.env must be the settings of the world; was it written by another version?")
     summary, versions = run.read_summary(), manifest.get("versions")
-    of_summary = str(run.summary_file)
+    since, first = (
+        math.inf if summary[key] is None else float(summary[key])
+        for key in ("certified_since_step", "first_certified_step")
+    )
     return Evidence(
         folder=run.folder,
         agent=_entry(config.get("agent"), "name", str, f"{where}.agent"),
-        env=_entry(summary, "env", str, of_summary),
+        env=_printable(summary["env"]),
         seed=_entry(config, "seed", int, where),
         # Dotted names, and values as JSON.
         settings={
@@ -198,8 +186,11 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
         world=config["env"],
         layout="\n".join(manifest["layout"]),
         gamma=_entry(config.get("evaluation"), "gamma", float, f"{where}.evaluation"),
-        optimal_value=_entry(summary, "optimal_value", float, of_summary),
-        seconds=_entry(summary, "train_seconds", float, of_summary),
+        optimal_value=float(summary["optimal_value"]),
+        certified=summary["certified"],
+        certified_since_step=since,
+        first_certified_step=first,
+        seconds=float(summary["train_seconds"]),
         started=str(manifest.get("started", ""))[:10],
         version=_printable(str(versions.get("gridworld", "?"))) if isinstance(versions, dict) else "?",
         curve=_read_curve(run),

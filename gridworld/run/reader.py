@@ -86,8 +86,16 @@ class RunReader(RunFolder):
         return content
 
     def read_summary(self) -> dict[str, Any]:
-        """The content of summary.json, verified as by `read`."""
-        return as_object(self.read(self.summary_file, LARGEST_JSON), self.summary_file)
+        """What the run reached, as summary.json has it, verified as by `read` and checked by `_RESULT`."""
+        content = as_object(self.read(self.summary_file, LARGEST_JSON), self.summary_file)
+        for key, (kind, what) in _RESULT.items():
+            value = content.get(key)
+            is_below_zero = kind in (int, int | None) and type(value) is int and value < 0
+            if key not in content or not _is(kind, value) or not str(value).strip() or is_below_zero:
+                raise InputError(
+                    f"{self.summary_file}: {key}={value!r} must be {what}; was it written by another version?"
+                )
+        return content
 
     def verify(self, path: Path) -> None:
         """Compare a file's checksum with the manifest's; an `InputError` where it is another file."""
@@ -242,7 +250,7 @@ def _is(kind: Any, value: Any) -> bool:
             isinstance(text, str) and name.isprintable() and PurePath(name).name == name not in ("", "..")
             for name, text in value.items()
         )
-    return isinstance(value, kind)
+    return isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
 
 
 _RESUMPTION = "resumption"
@@ -266,6 +274,18 @@ _ENTRIES: dict[str, tuple[Any, str]] = {
     "reached": _COUNT,
     "checkpoint": _COUNT,
     "versions": (dict, "a version for each package"),
+}
+_RESULT: dict[str, tuple[Any, str]] = {  # the entries of summary.json that are read again
+    "agent": (str, "a name"),
+    "env": (str, "a name"),
+    "timesteps": (int, "a number of steps"),
+    "best_step": (int, "a number of steps"),
+    "certified": (bool, "true or false"),
+    "first_certified_step": _COUNT,
+    "certified_since_step": _COUNT,
+    "regret": (int | float | None, "a number"),
+    "optimal_value": (int | float, "a number"),
+    "train_seconds": (int | float, "a number"),
 }
 
 

@@ -202,9 +202,8 @@ def _outcome(run: RunReader) -> dict[str, str]:
         started, ended = (datetime.fromisoformat(run.manifest[key]) for key in ("started", "ended"))
         found["seconds"] = f"{(ended - started).total_seconds():.2f}"
     if run.is_finished:
-        regret = run.read_summary().get("regret")
-        if isinstance(regret, int | float):
-            found["objective"] = repr(regret)
+        regret = run.read_summary()["regret"]
+        found["objective"] = "" if regret is None else repr(regret)
     return found
 
 

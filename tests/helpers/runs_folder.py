@@ -86,7 +86,9 @@ class Maker:
             "seed": seed,
             "timesteps": last["step"],
             "certified": bool(last["certified"]),
+            "best_step": last["step"],
             "first_certified_step": first,
+            "certified_since_step": first,  # for good
             "optimal_value": self.evaluator.optimal_value,
             "regret": last["regret"],
             "train_seconds": 1.5,
