@@ -37,7 +37,6 @@ REPORTED = sorted(
 _LONGEST_NAME = 80  # characters
 _LONGEST_SCOPE = 300
 _DIGITS = 9  # after the point: two ways to compute one regret differ later than that
-_KINDS = {str: "a name", int: "a whole number", float: "a number"}
 
 Settings = Mapping[str, str]  # flat: {"agent.gamma": "0.9"}
 
@@ -164,9 +163,12 @@ def _unfinished(run: RunReader) -> str:
 
 
 def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
-    manifest, config, where = run.manifest, run.manifest["config"], f"{run.manifest_file}: config"
+    manifest, config = run.manifest, run.manifest["config"]
     if not isinstance(config.get("env"), dict):
-        raise InputError(f"{where}.env must be the settings of the world; was it written by another version?")
+        raise InputError(
+            f"{run.manifest_file}: config.env must be the settings of the world; was it written by another "
+            "version?"
+        )
     summary, versions = run.read_summary(), manifest.get("versions")
     since, first = (
         math.inf if summary[key] is None else float(summary[key])
@@ -174,9 +176,9 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
     )
     return Evidence(
         folder=run.folder,
-        agent=_entry(config.get("agent"), "name", str, f"{where}.agent"),
+        agent=_printable(summary["agent"]),
         env=_printable(summary["env"]),
-        seed=_entry(config, "seed", int, where),
+        seed=summary["seed"],
         # Dotted names, and values as JSON.
         settings={
             printable(key): printable(value if isinstance(value, str) else json.dumps(value, sort_keys=True))
@@ -185,7 +187,7 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
         },
         world=config["env"],
         layout="\n".join(manifest["layout"]),
-        gamma=_entry(config.get("evaluation"), "gamma", float, f"{where}.evaluation"),
+        gamma=float(summary["gamma"]),
         optimal_value=float(summary["optimal_value"]),
         certified=summary["certified"],
         certified_since_step=since,
@@ -202,17 +204,6 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
         scope=printable(scope_of(summary))[:_LONGEST_SCOPE],
         damage=damaged,
     )
-
-
-def _entry(content: Any, key: str, kind: type, where: str) -> Any:
-    """A checked entry of a file; a name is made printable."""
-    value: Any = content.get(key) if isinstance(content, dict) else None
-    fits = isinstance(value, int | float if kind is float else kind) and not isinstance(value, bool)
-    if not fits or (kind is str and not value.strip()):
-        raise InputError(
-            f"{where}: {key}={value!r} must be {_KINDS[kind]}; was it written by another version?"
-        )
-    return _printable(value) if kind is str else kind(value)
 
 
 def _printable(text: str) -> str:

@@ -278,6 +278,8 @@ _ENTRIES: dict[str, tuple[Any, str]] = {
 _RESULT: dict[str, tuple[Any, str]] = {  # the entries of summary.json that are read again
     "agent": (str, "a name"),
     "env": (str, "a name"),
+    "seed": (int, "a whole number"),
+    "gamma": (int | float, "a number"),
     "timesteps": (int, "a number of steps"),
     "best_step": (int, "a number of steps"),
     "certified": (bool, "true or false"),

@@ -27,7 +27,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.envs.training_env import NO_EPISODES, Returns, TrainingVectorEnv
 from gridworld.run.writer import NEEDED
 from gridworld.world.evaluation import Evaluator, PolicySnapshot, Score
-from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score, regret_text
+from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, regret_text
 
 if TYPE_CHECKING:
     from gridworld.base.console import Progress
@@ -286,22 +286,12 @@ def _charts() -> dict[str, list[str]]:
 CHARTS = _charts()  # of TensorBoard's Custom Scalars tab, {title: tags}
 
 
-class CurveScalars:
-    """TensorBoard's scalars: a point per evaluation and metric, and the optimum with it."""
-
-    def __init__(self, write_scalars: WriteScalars, evaluator: Evaluator) -> None:
-        self._write_scalars = write_scalars
-        best = optimal_score(evaluator)
-        self._optimum = {
-            f"{OPTIMUM}/{metric.name}": float(metric.of(best)) for metric in METRICS if metric.has_optimum
-        }
-
-    def write(self, evaluation: Evaluation) -> None:
-        """Write one event with a value for every tag."""
-        greedy = [(metric, float(metric.of(evaluation.greedy))) for metric in METRICS]
-        tags = self._optimum | {_greedy_tag(metric): number for metric, number in greedy}
-        tags |= {f"{SAMPLED}/{name}": float(number) for name, number in numbers(evaluation.sampled).items()}
-        for metric in TRAINING_METRICS:
-            if (number := metric.of(evaluation.returns)) is not None:
-                tags[metric.tag] = number
-        self._write_scalars(tags, evaluation.step)
+def send_scalars(write_scalars: WriteScalars, best: Score, evaluation: Evaluation) -> None:
+    """Write TensorBoard's scalars, a value for every tag; `best` is the optimal policy's score."""
+    tags = {f"{OPTIMUM}/{metric.name}": float(metric.of(best)) for metric in METRICS if metric.has_optimum}
+    tags |= {_greedy_tag(metric): float(metric.of(evaluation.greedy)) for metric in METRICS}
+    tags |= {f"{SAMPLED}/{name}": float(number) for name, number in numbers(evaluation.sampled).items()}
+    for metric in TRAINING_METRICS:
+        if (number := metric.of(evaluation.returns)) is not None:
+            tags[metric.tag] = number
+    write_scalars(tags, evaluation.step)

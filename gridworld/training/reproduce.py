@@ -30,8 +30,7 @@ from gridworld.training.resume import open_unfinished, unfinished_of
 from gridworld.training.saved_run import read_visits
 from gridworld.training.session import CLOCK
 from gridworld.training.tensorboard import read_scalars
-from gridworld.training.together import run_alone
-from gridworld.training.train import training
+from gridworld.training.train import train
 from gridworld.world.mdp import Mdp
 
 CLOCK_TAGS = "time/"  # prefix of the TensorBoard tags of SB3's speed
@@ -79,7 +78,6 @@ def repeat(then: RunReader, folder: Path, config: TrainConfig, mdp: Mdp, trust: 
     overrides = then.manifest.get("overrides") or []
     logging = dataclasses.replace(config.logging, wandb=False)
     config = dataclasses.replace(config, total_timesteps=first, logging=logging)
-    own = training(config, folder, overrides, lambda env: mdp, is_trusted=False)
     if begun := find_run(folder):
         reached = begun.manifest["config"].get("total_timesteps")
         if reached in longer:
@@ -89,7 +87,7 @@ def repeat(then: RunReader, folder: Path, config: TrainConfig, mdp: Mdp, trust: 
         if not begun.is_finished:
             unfinished.resume()
     else:
-        run_alone(own)
+        train(config, folder, overrides, lambda env: mdp, is_trusted=False)
     for length in longer:
         open_unfinished(folder, trust).resume(length)
 

@@ -32,15 +32,16 @@ from gridworld.run.provenance import environment, identity
 from gridworld.run.writer import RunWriter, write_evaluations
 from gridworld.training.learning_curve import (
     CHARTS,
-    CurveScalars,
     LearningCurve,
     read_curve,
+    send_scalars,
     show_progress,
     write_row,
 )
 from gridworld.training.pictures import Pictures
 from gridworld.training.tensorboard import HOW_TO_READ, EventWriter, as_markdown, hparams
 from gridworld.world.mdp import Mdp
+from gridworld.world.metrics import optimal_score
 
 CLOCK = {"train_seconds", "evaluation_seconds"}  # the summary's times
 LOGS = {"curve": CURVE, "events": EVENTS}  # that a checkpoint has marks of, and the pattern of their names
@@ -92,14 +93,11 @@ class Session:
                 pictures.set_state(state["pictures"])
                 self.reached = self.checkpoints.newest = int(state["steps"])
                 self._started -= float(state["seconds"])
-        self._pace = Pace(self._checkpoint_every(), self.reached)
-
-    def _checkpoint_every(self) -> int | str | None:
-        every = self._config.checkpoint.every
-        if every is not None and (unknown := self._curve.agent.class_without_state()) is not None:
+        every = config.checkpoint.every
+        if every is not None and (unknown := curve.agent.class_without_state()) is not None:
             tell(f"no checkpoints, since {unknown} does not define get_state and set_state")
-            return None
-        return every
+            every = None
+        self._pace = Pace(every, self.reached)
 
     def progress(self) -> dict[str, int | None]:
         """How many steps were made, and how many of them are saved."""
@@ -121,8 +119,8 @@ class Session:
         label = f"{config.agent.name} on {curve.evaluator.mdp.name}"
         progress = Progress(config.total_timesteps, label, config.logging.progress)
         curve.sinks.append(partial(write_row, self._curve_log))
-        if self._trackers.write_scalars is not None:
-            curve.sinks.append(CurveScalars(self._trackers.write_scalars, curve.evaluator).write)
+        if (write_scalars := self._trackers.write_scalars) is not None:
+            curve.sinks.append(partial(send_scalars, write_scalars, optimal_score(curve.evaluator)))
         curve.sinks += [partial(show_progress, progress), self._pictures.write]
         succeeded = False
         try:
@@ -161,23 +159,20 @@ class Session:
         is_last = steps >= self._config.total_timesteps
         if (asked or is_last or self._pace.is_due(steps)) and steps != self.checkpoints.newest:
             started = time.perf_counter()
+            # A short run is over before a disk has anything, and waits for it at its end only (see `settle`).
+            durable = not is_last or self.checkpoints.newest is not None
             try:
-                self._save(steps, is_last)
+                if durable:
+                    self._curve_log.sync()
+                    if self._trackers.events is not None:
+                        self._trackers.events.log.sync()
+                    self._run.settle()
+                self.checkpoints.save(steps, self._state(steps), durable, small=is_last)
             except OSError as error:
                 _log.warning("%s: no checkpoint after step %s, %s", self._run.folder, steps, error.strerror)
             self._pace.took(steps, time.perf_counter() - started)
         if asked:
             self.stop.obey()
-
-    def _save(self, steps: int, is_last: bool) -> None:
-        # A short run is over before a disk has anything, and waits for it at its end only (see `settle`).
-        durable = not is_last or self.checkpoints.newest is not None
-        if durable:
-            self._curve_log.sync()
-            if (events := self._trackers.events) is not None:
-                events.log.sync()
-            self._run.settle()
-        self.checkpoints.save(steps, self._state(steps), durable, small=is_last)
 
     def _state(self, steps: int) -> State:
         config, events = self._config, self._trackers.events

@@ -84,6 +84,7 @@ class Maker:
             "agent": config["agent"]["name"],
             "env": self.layout.name,
             "seed": seed,
+            "gamma": config["evaluation"]["gamma"],
             "timesteps": last["step"],
             "certified": bool(last["certified"]),
             "best_step": last["step"],
