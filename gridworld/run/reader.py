@@ -266,10 +266,7 @@ _ENTRIES: dict[str, tuple[Any, str]] = {
     "overrides": ([str], "words of a command line"),
     "called_from": (str, "a path from the run's folder"),
     "sha256": ({}, "a checksum for each file"),
-    "resumed": (
-        [_RESUMPTION],
-        "a list of resumptions, with their steps",
-    ),
+    "resumed": ([_RESUMPTION], "a list of resumptions, with their steps"),
     NUMBERS_DEPEND_ON: ({}, "a hash for each run, by the name of its folder"),
     "reached": _COUNT,
     "checkpoint": _COUNT,

@@ -110,8 +110,7 @@ class Unfinished:
                 f"total_timesteps={2 * old_total}"
             )
         continued = partial(self._beginning, anyway)
-        overrides = self.run.manifest.get("overrides", [])
-        return training(config, folder, overrides, lambda env: self.mdp, on_built, self.is_trusted, continued)
+        return training(config, folder, [], lambda env: self.mdp, on_built, self.is_trusted, continued)
 
     resume = alone(resumption)
 

@@ -63,12 +63,7 @@ _log = logging.getLogger("gridworld")
 
 
 class Session:
-    """A run at work, new or continued from a checkpoint's `state`; `StateError` where that does not fit.
-
-    Attributes:
-        reached: environment steps.
-        stop: whether a signal has asked for an end.
-    """
+    """A run at work, new or continued from a checkpoint's `state`; `StateError` where that does not fit."""
 
     def __init__(
         self,
@@ -81,7 +76,8 @@ class Session:
     ) -> None:
         self._config, self._continued_from = config, state
         self._curve, self._pictures, self._trackers = curve, pictures, trackers
-        self.reached, self.checkpoints, self.stop = 0, Checkpoints(folder), StopRequest()
+        self.checkpoints, self.stop = Checkpoints(folder), StopRequest()
+        self.reached = 0  # environment steps
         self._origin = {
             "identity": identity(config, curve.evaluator.mdp.text()),
             "environment": environment(config.agent),

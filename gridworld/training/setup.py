@@ -93,11 +93,9 @@ def without_pictures(config: TrainConfig) -> TrainConfig:
 
 def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
     """What a user should know of the settings before training: where they come from, what they cannot do."""
-    found = [] if (recipe := _recipe_note(config, mdp)) is None else [recipe]
-    if config.known_failure is not None:
-        found.append(f"agent={config.agent.name} is known to fail: {config.known_failure}")
-    note = objective_note(config, mdp)
-    return found if note is None else [*found, note]
+    failure = config.known_failure
+    fails = None if failure is None else f"agent={config.agent.name} is known to fail: {failure}"
+    return [note for note in (_recipe_note(config, mdp), fails, objective_note(config, mdp)) if note]
 
 
 def _recipe_note(config: TrainConfig, mdp: Mdp) -> str | None:

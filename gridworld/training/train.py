@@ -70,9 +70,8 @@ def training(
             agent = config.agent.build(context)
             if on_built is not None:
                 on_built(agent)
-            visits = context.envs.visits
             curve = LearningCurve(evaluator, agent, config, context.envs)
-            pictures = Pictures(config, folder, evaluator, visits, trackers.events, is_trusted)
+            pictures = Pictures(config, folder, evaluator, context.envs.visits, trackers.events, is_trusted)
             session = Session(config, folder, curve, pictures, trackers, state)
             run = begin()
             try:
@@ -93,7 +92,7 @@ def training(
                     write_bytes(run.model_file, agent.model_file())
                     write_bytes(run.best_model_file, curve.best.content)
                     session.write_evaluations()
-                    write_bytes(run.visits_file, npy_bytes(visits))
+                    write_bytes(run.visits_file, npy_bytes(context.envs.visits))
                     write_json(run.summary_file, _as_json(summary))
                     trackers.show(summary)
                     with ThreadPoolExecutor(1) as disk:  # pictures are drawn while it is waited for
