@@ -63,7 +63,7 @@ def training(
         mdp = check_settings(config, world)
         state, begin = continued(config, mdp) if continued else _new_run(config, folder, overrides, mdp)
         with _failures_explained(config, folder):
-            # Nothing is written before all parts are made, and fit a checkpoint's state.
+            # Nothing is written before all that takes part is made, and fits a checkpoint's state.
             evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
             trackers = Trackers(config, folder, mdp, state)
             context = make_context(config, mdp, trackers.write_scalars)
@@ -73,7 +73,7 @@ def training(
             curve = LearningCurve(evaluator, agent, config, context.envs)
             pictures = Pictures(config, folder, evaluator, context.envs.visits, trackers.events, is_trusted)
             session = Session(config, folder, curve, pictures, trackers, state)
-            run = begin()
+            run = begin()  # which writes the manifest
             try:
                 log.open(run.log_file)
                 if state is None:
@@ -112,7 +112,7 @@ train = alone(training)
 
 
 def _new_run(config: TrainConfig, folder: Path, overrides: list[str], mdp: Mdp) -> Beginning:
-    """Print what a user should know of the settings; a run is the first in its folder."""
+    """Print what a user should know of the settings; the run begins without a state."""
     for note in notes(config, mdp) if config.logging.progress else ():
         tell(note)
     manifest = folder / MANIFEST
