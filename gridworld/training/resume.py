@@ -119,9 +119,8 @@ class Unfinished:
         self._tell_if_map_changed()
         with telling_if_slow(f"reading the checkpoints of {self.run.folder}"):
             state = _newest_state(self.run, identity(config, mdp.text()))
-        if state is None:
-            return None, partial(self._restart, config)
-        return state, self._continue(config, state, anyway)
+        again = partial(self._restart, config)
+        return state, again if state is None else self._continue(config, state, anyway)
 
     def _restart(self, config: TrainConfig) -> RunWriter:
         """Start again, which a finished run is too good for."""

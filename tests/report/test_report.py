@@ -138,6 +138,7 @@ def test_agents_are_ranked_by_since_when_they_are_certified_for_good(maker: Make
         writer.writeheader()
         writer.writerows(rows)
         change(early, "curve.csv", text.getvalue())
+        in_json(early, "summary.json", first_certified_step=2000)
     report = gather([tmp_path])
     (task,) = report.tasks
     assert [result.group.agent for result in task.ranked] == ["steady", "early"]
