@@ -4,74 +4,53 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from plan import LIBRARIES, ROOT, Job, World, python_of
+from plan import LIBRARIES, ROOM, ROOT, Job, python_of
 
 from gridworld.base.errors import InputError
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.evaluation import Score
 
 ROWS = ROOT / "docs" / "data" / "atlas.csv"
-_WORKER = Path(__file__).with_name("adapters.py")
+KEY = 7  # fields by which a row is known
+_START = 5.0  # seconds until a worker trains
 
 
-@dataclass(frozen=True)
-class Row:
-    """A run, as the CSV has it.
-
-    Attributes:
-        done: environment steps that it took.
-        certified_since: of the first evaluation after which no later one fails; "" if the last one fails.
-        regret: of its last policy.
-        cause: why it is not certified, by `diagnose`, where that was asked.
-        curve: "step:regret" where the exact regret or the certificate changed, "*" where certified.
-    """
+class Row(NamedTuple):
+    """A run, as the CSV has it."""
 
     page: str
     library: str
     algorithm: str
     world: str
     seed: str
-    digest: str
+    digest: str  # of settings, steps and the world's tables
     versions: str
-    done: int
+    done: int  # environment steps
     every: int
     seconds: float
-    certified_since: str
-    regret: float
-    cause: str
-    curve: str
-
-    @property
-    def key(self) -> tuple[str, ...]:
-        return tuple(getattr(self, name) for name in _KEY)
-
-    @property
-    def steps_to_certified(self) -> float:
-        return float(self.certified_since or math.inf)
+    certified_since: str  # the first evaluation after which no later one fails; "" where the last one does
+    regret: float  # of the last policy
+    cause: str  # why it is not certified, where `diagnose` was asked
+    curve: str  # "step:regret", with "*" where certified, wherever that changed
 
     def regrets(self) -> np.ndarray:
-        """The regret at every N steps and at the end, certified ones as 0."""
+        """The regret at each point of `grid`, certified ones as 0."""
         points = [point.split(":") for point in self.curve.split()]
-        steps = [int(step) for step, _ in points]
         values = np.array([0.0 if text.endswith("*") else float(text) for _, text in points])
-        return values[np.searchsorted(steps, grid(self.done, self.every), side="right") - 1]
-
-
-_KEY = ("page", "library", "algorithm", "world", "seed", "digest", "versions")
+        places = np.searchsorted([int(step) for step, _ in points], grid(self.done, self.every), side="right")
+        return values[places - 1]
 
 
 def grid(done: int, every: int) -> np.ndarray:
@@ -80,91 +59,79 @@ def grid(done: int, every: int) -> np.ndarray:
 
 
 def read(path: Path) -> list[Row]:
-    """All rows of a file, or none where there is no file."""
+    """All rows of a file; none where there is no file."""
     if not path.exists():
         return []
     kinds: dict[str, Any] = {"done": int, "every": int, "seconds": float, "regret": float}
     with path.open(encoding="utf-8", newline="") as file:
         try:
-            return [
-                Row(**{name: kinds.get(name, str)(value) for name, value in row.items()})
-                for row in csv.DictReader(file)
-            ]
-        except (TypeError, ValueError):
-            raise InputError(f"{path}: has other columns or a line that is cut off; delete that line") from None
+            found = list(csv.DictReader(file))
+            lines = [{name: kinds.get(name, str)(row[name]) for name in Row._fields} for row in found]
+        except (KeyError, TypeError, ValueError):
+            raise InputError(
+                f"{path}: has other columns or a line that is cut off; delete that line"
+            ) from None
+    return [Row(**line) for line in lines]
 
 
 def append(path: Path, row: Row) -> None:
-    """Add a row in one write, so that a kill leaves whole lines."""
+    """Add a row, and before the first one the names of the columns."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    is_new = not path.exists()
+    lines = [row] if path.exists() else [Row._fields, row]
     with path.open("a", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        if is_new:
-            writer.writerow([field.name for field in fields(Row)])
-        writer.writerow(asdict(row).values())
+        csv.writer(file, lineterminator="\n").writerows(lines)
 
 
 def work(job: Job, **more: Any) -> Iterator[dict[str, Any]]:
-    """The lines that a worker writes for a job."""
-    told = {**job.content, "seed": job.seed, "world": job.world.tables, **more}
+    """The lines that a worker writes for a job; those with actions have their exact `score`."""
+    task = {**job.content, "seed": job.seed, "world": job.world.tables, "room": str(ROOM), **more}
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
     if job.content["library"] == "engine":
-        environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
-        process = subprocess.Popen(
-            [str(python_of(job.library)), str(_WORKER)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment,
-        )  # fmt: skip
+        environment["PYTHONPATH"] = str(ROOT)
+    command = [str(python_of(job.library)), str(Path(__file__).with_name("adapters.py"))]
+    known: dict[str, Score] = {}
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as errors, subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment
+    ) as process:  # fmt: skip
         try:
             assert process.stdin
             assert process.stdout
-            process.stdin.write(json.dumps(told) + "\n")
+            process.stdin.write(json.dumps(task) + "\n")
             process.stdin.close()
-            yield from map(json.loads, process.stdout)
+            for line in map(json.loads, process.stdout):
+                if actions := line.pop("actions", None):
+                    if str(actions) not in known:
+                        policy = one_hot_policy(np.array(actions), job.world.mdp.num_actions)
+                        known[str(actions)] = job.world.evaluator.score(policy)
+                    score = line["score"] = known[str(actions)]
+                    line |= {"regret": score.regret, "certified": score.certified}
+                yield line
             if process.wait():
                 errors.seek(0)
-                last = (errors.read().strip() or "it said nothing").splitlines()[-1]
-                where = f"{job.library} {job.algorithm} {job.world.name}, seed {job.seed}"
-                raise InputError(f"{where}: {last}")
+                last = (errors.read().strip() or "it ended without a word").splitlines()[-1]
+                raise InputError(f"{' '.join(job.key[1:5])}: {last}")
         finally:
             process.kill()
-            process.wait()
-
-
-def scored(world: World, actions: list[int], known: dict[bytes, Score]) -> Score:
-    """The exact score of the actions that a library takes in all states."""
-    table = np.array(actions)
-    if table.tobytes() not in known:
-        known[table.tobytes()] = world.evaluator.score(one_hot_policy(table, world.mdp.num_actions))
-    return known[table.tobytes()]
 
 
 def run(job: Job) -> Row:
     """Train a job, and make a row of it."""
-    points, known, told = [], {}, {"cause": ""}
+    curve, since, before, last = [], "", "", {"cause": ""}
     for line in work(job):
-        told |= line
-        if "actions" in line:
-            score = scored(job.world, line["actions"], known)
-            points.append((line["step"], score.regret, score.certified))
-        elif "regret" in line:
-            points.append((line["step"], line["regret"], line["certified"]))
-    since, curve, before = "", [], None
-    for step, regret, certified in points:
-        since = (since or str(step)) if certified else ""
-        text = f"{regret:.9g}{'*' if certified else ''}"
-        if text != before:
-            curve.append(f"{step}:{text}")
-        before = text
-    regret = 0.0 if points[-1][2] else float(f"{points[-1][1]:.9g}")
-    rest = (points[-1][0], job.content["every"], round(told["seconds"], 1), since, regret, told["cause"])
-    return Row(*job.key, *rest, " ".join(curve))
+        last |= line
+        if "regret" in line:
+            since = (since or str(line["step"])) if line["certified"] else ""
+            text = f"{line['regret']:.9g}{'*' if line['certified'] else ''}"
+            curve += [f"{line['step']}:{text}"] if text != before else []
+            before = text
+    regret = 0.0 if since else float(f"{last['regret']:.9g}")
+    rest = (job.content["every"], round(last["seconds"], 1), since, regret, last["cause"], " ".join(curve))
+    return Row(*job.key, last["step"], *rest)
 
 
-def missing(jobs: Iterable[Job], path: Path) -> list[Job]:
+def missing(jobs: list[Job], path: Path) -> list[Job]:
     """The jobs of which there is no row."""
-    there = {row.key for row in read(path)}
+    there = {row[:KEY] for row in read(path)}
     return [job for job in jobs if job.key not in there]
 
 
@@ -172,33 +139,27 @@ def estimate(jobs: list[Job], path: Path, processes: int) -> str:
     """How long the jobs take, by the rows that are there."""
     seconds = defaultdict(list)
     for row in read(path):
-        seconds[row.page, row.library, row.algorithm].append(row.seconds)
+        seconds[row.page, row.library, row.algorithm].append(row.seconds + _START)
     kinds = [(job.page, job.library, job.algorithm) for job in jobs]
-    unknown = sorted({" ".join(kind[1:]) for kind in kinds if kind not in seconds})
-    total = sum(statistics.median(seconds[kind]) + 5 for kind in kinds if kind in seconds)  # 5 s to start
-    known = sum(kind in seconds for kind in kinds)
-    text = f"{len(jobs)} rows to run; {known} of them take about {total / processes / 3600:.1f} hours"
-    return text + (f"; no time is known of: {', '.join(unknown)}" if unknown else "")
+    known = [statistics.median(seconds[kind]) for kind in kinds if kind in seconds]
+    unknown = ", ".join(sorted({" ".join(kind[1:]) for kind in kinds if kind not in seconds}))
+    text = f"{len(jobs)} rows to run; {len(known)} of them take {sum(known) / processes / 3600:.2f} hours"
+    return text + (f"; no time is known of {unknown}" if unknown else "")
 
 
 def run_all(jobs: list[Job], path: Path, processes: int) -> list[str]:
-    """Run what is missing, so many at once; returns what failed."""
-    for library in {job.library for job in jobs}:
-        python_of(library)
+    """Run jobs, so many at once; returns what failed."""
     failed = []
     with ThreadPoolExecutor(processes) as pool:
         futures = [pool.submit(run, job) for job in jobs]
         try:
             for count, future in enumerate(as_completed(futures), 1):
-                try:
-                    row = future.result()
-                except InputError as error:
+                if isinstance(error := future.exception(), InputError):
                     failed.append(str(error))
                     continue
-                append(path, row)
+                append(path, row := future.result())
                 end = f"certified since {row.certified_since}" if row.certified_since else "not certified"
-                name = f"{row.library} {row.algorithm} {row.world} {row.seed}"
-                print(f"{count}/{len(jobs)} {name}: {end}, {row.seconds} s", flush=True)
+                print(f"{count}/{len(jobs)} {' '.join(row[1:5])}: {end}, {row.seconds} s", flush=True)
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
     return failed
@@ -209,16 +170,10 @@ def install(library: str) -> None:
 
     The environment variable ATLAS_SOURCE names another copy of that repository, a folder or an address.
     """
-    from plan import ROOM
-
-    pins, source = LIBRARIES[library].pins, LIBRARIES[library].source
-    if not pins:
-        raise InputError(f"install {library}: is part of this environment")
-    folder = ROOM / library
+    folder, (_, _, pins, (address, commit)) = ROOM / library, LIBRARIES[library]
     subprocess.run([sys.executable, "-m", "venv", folder], check=True)
     subprocess.run([folder / "bin" / "python", "-m", "pip", "install", "-q", *pins], check=True)
-    if source is not None:
-        address, commit = os.environ.get("ATLAS_SOURCE", source[0]), source[1]
-        if not (folder / "source").exists():
-            subprocess.run(["git", "clone", "-q", "-n", address, folder / "source"], check=True)
+    if address and not (folder / "source").exists():
+        address = os.environ.get("ATLAS_SOURCE", address)
+        subprocess.run(["git", "clone", "-q", "-n", address, folder / "source"], check=True)
         subprocess.run(["git", "-C", folder / "source", "checkout", "-q", commit], check=True)
