@@ -1,20 +1,17 @@
 """Trains one agent with one library's own code, and reads its greedy policy while it learns.
 
 It runs in that library's Python, a process for each row, and needs nothing of this package but for `engine`.
-It reads a job as a line of JSON and writes lines: {"step": 1000, "actions": [...]} for each point of the curve,
-and at the end {"seconds": 12.3}. The world is tables that the job brings; `gym.make("Atlas-v0")` makes it, with
-Gymnasium's own step limit and one-hot observations. The environment reads the policies: before the step that
-follows every N steps it asks for the actions in all states, so a library's loop is as it was published.
+It reads a job as JSON and writes a line of it, {"step": 1000, "actions": [...]}, for each point of the curve.
+The world is tables that the job brings; `gym.make("Atlas-v0")` makes it, with Gymnasium's own step limit and
+one-hot observations. The environment reads the policies: before the step that follows every N steps it asks
+for the actions in all states, so that a library's loop is untouched.
 """
-
-from __future__ import annotations
 
 import importlib
 import json
 import os
 import sys
 import tempfile
-import time
 from bisect import bisect_right
 from collections.abc import Callable
 from pathlib import Path
@@ -23,8 +20,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-Greedy = Callable[[np.ndarray], Any]  # observations (n, N) to actions (n,)
-Saved = Callable[[str], Greedy]  # saves the model at a path, and loads it from there
+Greedy = Callable[[np.ndarray], Any]  # observations (n, N) to actions (n,); a Saved makes one of a path
+Saved = Callable[[str], Greedy]
 
 
 class Reader:
@@ -79,10 +76,8 @@ def plain(job: dict[str, Any], reader: Reader) -> None:
     s, rng, env = job["settings"], np.random.default_rng(job["seed"]), gym.make("Atlas-v0")
     q = np.full((reader.rows.shape[1], int(env.action_space.n)), s["initial_value"])
     reader.greedy = lambda rows: q[rows.argmax(axis=1)].argmax(axis=1)
-    state, first, last = (
-        env.reset(seed=job["seed"])[0].argmax(),
-        *(s[f"exploration_{x}_eps"] for x in ("initial", "final")),
-    )
+    first, last = s["exploration_initial_eps"], s["exploration_final_eps"]
+    state = env.reset(seed=job["seed"])[0].argmax()
     for step in range(job["steps"]):
         epsilon = first + min(step / job["steps"] / s["exploration_fraction"], 1.0) * (last - first)
         greedy = rng.choice(np.flatnonzero(q[state] == q[state].max()))
@@ -121,9 +116,7 @@ def cleanrl(job: dict[str, Any], reader: Reader) -> Saved:
     sys.argv = [script.name]
     for name, value in {**fixed, **job["settings"]}.items():
         word = name.replace("_", "-")
-        sys.argv += (
-            [f"--{'' if value else 'no-'}{word}"] if isinstance(value, bool) else [f"--{word}", str(value)]
-        )
+        sys.argv += [f"--no-{word}"] if value is False else [f"--{word}", str(value)]
     space: dict[str, Any] = {"__name__": "__main__", "__file__": str(script)}
 
     def network() -> Any:
@@ -152,9 +145,8 @@ def engine(job: dict[str, Any], reader: Reader) -> None:
 
     length = [f"total_timesteps={job['steps']}", f"evaluation.every={job['every']}"]
     run = gridworld.train(*job["words"], *length, seed=job["seed"], progress=False)
-    names = ("step", "regret", "certified")
-    for line in zip(*(run.curve[name].tolist() for name in names), strict=True):
-        reader.write(**dict(zip(names, line, strict=True)))
+    for step, regret, certified in zip(*map(run.curve.get, ("step", "regret", "certified")), strict=True):
+        reader.write(step=int(step), regret=float(regret), certified=bool(certified))
     if job.get("diagnose") and not run.summary["certified"]:
         reader.write(cause=gridworld.diagnose(run).cause)
 
@@ -177,19 +169,16 @@ ADAPTERS = {"sb3": sb3_like, "sbx": sb3_like, "cleanrl": cleanrl, "engine": engi
 
 def main() -> None:
     """One job, from standard input to standard output, on which a library may not print."""
-    job, out = json.loads(sys.stdin.readline()), sys.stdout
+    job, out = json.load(sys.stdin), sys.stdout
     sys.stdout, reader = sys.stderr, Reader(job, out)
     made = {"entry_point": lambda: TableEnv(job["world"], reader), "disable_env_checker": True}
     gym.register("Atlas-v0", max_episode_steps=job["world"]["limit"], **made)
     with tempfile.TemporaryDirectory() as place:
         os.chdir(place)  # where CleanRL writes runs/
-        started = time.perf_counter()
         saved = ADAPTERS[job["library"]](job, reader)
         reader.read()
-        reader.write(seconds=time.perf_counter() - started)
         if "play" in job and saved is not None:
             reader.write(**play(job["play"], saved(f"{place}/model")))
-        os.chdir("/")
 
 
 if __name__ == "__main__":

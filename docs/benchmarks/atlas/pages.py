@@ -1,23 +1,109 @@
-"""The tables and figures of the two pages, drawn from the CSV between the marks `<!-- atlas: NAME -->`."""
-
-from __future__ import annotations
+"""What rows show, with intervals: two pages are filled between their marks, `<!-- atlas: NAME -->`."""
 
 import itertools
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from analysis import SEED, Comparison, Group, caution, groups
-from plan import CLEANRL, FIXED, LIBRARIES, MARGIN, MATCHED, NOT_HERE, ROOT
-from rows import Row
+from plan import CLEANRL, LIBRARIES, MARGIN, MATCHED, ROOT, Job, World, worlds_of
+from rows import Row, grid
+from scipy import stats
 
 from gridworld.report import statistics
 from gridworld.report.chart import compact, house_style, styles
 
+SEED = 0  # of the bootstrap
+_LEVEL = 0.05  # of each one-sided test
+_FEW, _PLANNED = 10, 50
 _DOCS = ROOT / "docs"
+_TWO = "{:.2f}".format
+_SHOWN = ("certified for good", "median steps to it", "regret at the end", "a run takes")
+
+
+@dataclass(frozen=True)
+class Group:
+    """The rows of one library's algorithm in one world."""
+
+    library: str
+    algorithm: str
+    world: World
+    rows: list[Row]  # by seed
+
+    @property
+    def steps(self) -> np.ndarray:
+        """(n,), steps to certified for good; infinity where it is not."""
+        return np.array([float(row.certified_since or math.inf) for row in self.rows])
+
+    @property
+    def certified(self) -> statistics.Share:
+        return statistics.share(int(np.isfinite(self.steps).sum()), len(self.rows))
+
+
+def groups(rows: Sequence[Row], page: str) -> list[Group]:
+    """The rows of a page as its settings are now, with each library's newest versions in the file."""
+    newest = {row.library: row.versions for row in rows if row.page == page}
+    kept = []
+    for algorithm, world, library in itertools.product(MATCHED, worlds_of(page), LIBRARIES):
+        name = (page, library, algorithm, world.name)
+        own = [row for row in rows if row[:4] == name and row.versions == newest[library]]
+        if own and (own := [row for row in own if row.digest == Job(*name[:3], world, 0).digest]):
+            kept.append(Group(library, algorithm, world, sorted(own, key=lambda row: int(row.seed))))
+    return kept
+
+
+class Comparison(NamedTuple):
+    """Two libraries' same algorithm in the same world, by steps to certified for good."""
+
+    verdict: str  # of this pair alone, without a correction for how many pairs there are
+    identical: int  # on how many seeds both have the same curve, in every digit
+    improvement: statistics.Interval  # the probability that a run of the first needs fewer steps
+    ratio: statistics.Interval | None  # of geometric means, 90 %; None where a run was not certified
+    p: float | None  # of two one-sided tests
+
+
+def compare(first: Group, second: Group) -> Comparison:
+    """Compare two groups."""
+    least, both = min(len(first.rows), len(second.rows)), (first.steps, second.steps)
+    curves = {row.seed: (row.curve, row.done) for row in first.rows}
+    identical = sum(curves.get(row.seed) == (row.curve, row.done) for row in second.rows)
+    is_whole = bool(np.isfinite(np.concatenate(both)).all()) and least > 1
+    ratio, p = equivalence(*both) if is_whole else (None, None)
+    apart = ratio or statistics.difference(first.certified, second.certified)
+    is_apart = apart.low > (ratio is not None) or apart.high < (ratio is not None)  # than 1, than 0
+    verdict = "differ" if is_apart else "undecided"
+    verdict = "equal" if p is not None and p <= _LEVEL else verdict
+    verdict = "too few seeds" if least < _FEW else verdict
+    verdict = "the same curves" if identical == least else verdict
+    return Comparison(verdict, identical, statistics.improvement([(-both[0], -both[1])], SEED), ratio, p)
+
+
+def equivalence(one: np.ndarray, other: np.ndarray) -> tuple[statistics.Interval, float]:
+    """The ratio of geometric means with its 90 % interval, and the p value of two one-sided Welch tests.
+
+    D. Schuirmann, Journal of Pharmacokinetics and Biopharmaceutics 15, 1987.
+    """
+    logs, margin = [np.log(np.maximum(steps, 1)) for steps in (one, other)], math.log(MARGIN)
+    gap, parts = logs[0].mean() - logs[1].mean(), [log.var(ddof=1) / len(log) for log in logs]
+    error = math.sqrt(sum(parts))
+    if error == 0:
+        return statistics.Interval(*[math.exp(gap)] * 3), float(abs(gap) >= margin)
+    freedom = sum(parts) ** 2 / sum(part**2 / (len(log) - 1) for part, log in zip(parts, logs, strict=True))
+    half = stats.t.ppf(1 - _LEVEL, freedom) * error
+    p = max(stats.t.sf((margin + side * gap) / error, freedom) for side in (1, -1))
+    return statistics.Interval(*(math.exp(gap + side * half) for side in (0, -1, 1))), float(p)
+
+
+def caution(found: Sequence[Group]) -> str:
+    """How much so many seeds allow to say."""
+    counts = sorted(len(group.rows) for group in found) or [0]
+    number = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1])))) + " seeds"
+    few = ": a smoke test, no claim" if counts[0] < _FEW else ": a first look"
+    return f"**{number}{few if counts[0] < _PLANNED else ''}.**"
 
 
 def draw(rows: list[Row], docs: Path = _DOCS) -> None:
@@ -45,26 +131,18 @@ def _number(value: float) -> str:
 
 
 def _interval(found: statistics.Interval, text: Callable[[float], str] = _number) -> str:
-    return text(found.point) + (
-        "" if math.isnan(found.low) else f" ({text(found.low)} to {text(found.high)})"
-    )
+    bounds = "" if math.isnan(found.low) else f" ({text(found.low)} to {text(found.high)})"
+    return text(found.point) + bounds
 
 
 def _about(found: Sequence[Group]) -> dict[str, str]:
-    """Caution, versions and cost, which both pages have."""
-    seconds = defaultdict(list)
-    for group in found:
-        seconds[group.library, group.algorithm] += [row.seconds for row in group.rows]
-    lines = [
-        (*kind, str(len(each)), f"{np.median(each):.0f} s", f"{sum(each) / 3600:.2f} h")
-        for kind, each in sorted(seconds.items())
-    ]
+    """Caution and versions, which both pages have."""
     versions = sorted({f"- `{group.library}`: {group.rows[0].versions}" for group in found})
-    return {
-        "caution": caution(found) if found else "No rows yet.",
-        "cost": _table(("library", "algorithm", "rows", "median of a row", "sum"), lines, 2),
-        "versions": "\n".join(versions) or "No rows yet.",
-    }
+    return {"caution": caution(found), "versions": "\n".join(versions) or "No rows yet."}
+
+
+def _seconds(found: Sequence[Group]) -> str:
+    return f"{np.median([row.seconds for group in found for row in group.rows]):.0f} s"
 
 
 def _implementations(found: list[Group], figures: Path) -> dict[str, str]:
@@ -73,52 +151,29 @@ def _implementations(found: list[Group], figures: Path) -> dict[str, str]:
         regret = np.array([row.regret for row in group.rows])
         steps = statistics.interval(statistics.median, [group.steps], SEED)
         last = statistics.interval(statistics.iqm, [regret], SEED)
-        cells = (_share(group.certified), _interval(steps), _interval(last))
+        cells = (_share(group.certified), _interval(steps), _interval(last), _seconds([group]))
         lines.append((group.algorithm, group.world.name, group.library, *cells))
     for one, other in itertools.combinations(found, 2):
         if (one.algorithm, one.world.name) == (other.algorithm, other.world.name):
-            pair = Comparison(one, other)
-            ratio, p = pair.equivalence or (None, None)
-            pairs.append(
-                (
-                    *(one.algorithm, one.world.name, f"{one.library} : {other.library}", pair.verdict),
-                    f"{pair.identical} of {pair.seeds}",
-                    _interval(pair.improvement, "{:.2f}".format),
-                    "" if ratio is None else _interval(ratio, "{:.2f}".format),
-                    "" if p is None else f"{p:.3f}",
-                )
-            )
+            verdict, identical, improvement, ratio, p = compare(one, other)
+            same = f"{identical} of {min(len(one.rows), len(other.rows))}"
+            tested = ("", "") if ratio is None else (_interval(ratio, _TWO), f"{p:.3f}")
+            place = (one.algorithm, one.world.name, f"{one.library} : {other.library}")
+            pairs.append((*place, verdict, same, _interval(improvement, _TWO), *tested))
     named = ("algorithm", "world", "library")
     tested = ("same curve", "P(first is faster)", "ratio of steps, 90 %", f"p, margin {MARGIN}")
     drawn = [_curves(name, found, figures) for name in MATCHED if any(g.algorithm == name for g in found)]
-    there = {group.library for group in found}
-    missing = [f"- {name}: {reason}" for name, reason in NOT_HERE.items()]
-    missing += [f"- {name}: its adapter is here, no rows yet" for name in LIBRARIES if name not in there]
+    settings = [
+        (algorithm, f"`{name}`", str(value), f"`{CLEANRL[name]}`" if name in CLEANRL else "")
+        for algorithm, matched in MATCHED.items()
+        for name, value in matched.items()
+    ]
     return _about(found) | {
-        "settings": _settings(),
-        "missing": "\n".join(missing),
-        "results": _table((*named, "certified for good", "median steps to it", "regret at the end"), lines),
+        "settings": _table(("algorithm", "setting", "value", "CleanRL's name for it"), settings, 2),
+        "results": _table((*named, *_SHOWN), lines),
         "pairs": _table((*named[:2], "pair", "verdict", *tested), pairs, 4),
         "figures": "\n\n".join(drawn),
     }
-
-
-def _settings() -> str:
-    """The matched settings by each library's names, and what no setting changes."""
-    lines = []
-    for algorithm, matched in MATCHED.items():
-        fixed = {subject: cells for (of, subject), cells in FIXED.items() if of == algorithm}
-        for name, value in matched.items():
-            cells = fixed.pop(name, {})
-            names = {"cleanrl": CLEANRL.get(name, name)}
-            owners = [each for each in LIBRARIES if algorithm in LIBRARIES[each].algorithms]
-            own = {each: cells.get(each, f"`{names.get(each, name)}`") for each in owners}
-            lines.append((algorithm, f"`{name}` = {value}", *(own.get(each, "") for each in LIBRARIES)))
-        lines += [
-            (algorithm, subject, *(cells.get(each, "") for each in LIBRARIES))
-            for subject, cells in fixed.items()
-        ]
-    return _table(("algorithm", "setting", *LIBRARIES), lines, 9)
 
 
 def _curves(algorithm: str, found: Sequence[Group], figures: Path) -> str:
@@ -135,17 +190,15 @@ def _curves(algorithm: str, found: Sequence[Group], figures: Path) -> str:
             axis.set(title=world, xlabel="steps", ylabel="regret")
             axis.xaxis.set_major_formatter(compact)
             for group in (each for each in own if each.world.name == world):
-                steps, point, low, high = group.curve()
+                regrets = np.stack([row.regrets() for row in group.rows], axis=1)
+                steps = grid(group.rows[0].done, group.rows[0].every)
+                point, low, high = statistics.bands(statistics.iqm, [regrets], SEED)
                 [handles[group.library]] = axis.plot(steps, point, **drawn[group.library])
                 axis.fill_between(steps, low, high, alpha=0.2, color=drawn[group.library]["color"], lw=0)
         figure.legend(handles.values(), handles, loc="outside upper left", ncols=len(handles))
-        return _saved(figure, figures / f"atlas_{algorithm}.svg", f"Exact regret of {algorithm} over steps")
-
-
-def _saved(figure: plt.Figure, path: Path, title: str) -> str:
-    figure.savefig(path, metadata={"Date": None})
+        figure.savefig(figures / f"atlas_{algorithm}.svg", metadata={"Date": None})
     plt.close(figure)
-    return f"![{title}](../data/{path.name})"
+    return f"![Exact regret of {algorithm} over steps](../data/atlas_{algorithm}.svg)"
 
 
 def _defaults(found: list[Group], figures: Path) -> dict[str, str]:
@@ -157,12 +210,14 @@ def _defaults(found: list[Group], figures: Path) -> dict[str, str]:
     for kind, own in sorted(kinds.items()):
         each = [row for group in own for row in group.rows]
         share = statistics.share(sum(bool(row.certified_since) for row in each), len(each))
-        regret = statistics.interval(statistics.mean, [_scaled(group) for group in own], SEED)
+        scales = [abs(group.world.evaluator.optimal_value) for group in own]
+        shares = [np.minimum([row.regret for row in g.rows] / s, 1) for g, s in zip(own, scales, strict=True)]
+        regret = statistics.interval(statistics.mean, shares, SEED)
         causes = Counter(row.cause for row in each if row.cause).most_common()
         why = ", ".join(f"{cause} {count}" for cause, count in causes)
-        cells = (_share(share), _interval(regret, "{:.2f}".format), why)
+        cells = (_share(share), _interval(regret, _TWO), _seconds(own), why)
         lines.append((*kind, str(len(own)), str(len(each)), *cells))
-    head = ("library", "algorithm", "worlds", "runs", "certified for good", "regret, share of the optimum's")
+    head = ("library", "algorithm", "worlds", "runs", *_SHOWN[::2], _SHOWN[3], "causes by `diagnose`")
     places = [
         (
             *(world.name, "yes" if world.mdp.is_stochastic else "no", str(world.mdp.num_states)),
@@ -173,31 +228,6 @@ def _defaults(found: list[Group], figures: Path) -> dict[str, str]:
     ]
     named = [" ".join(kind) for kind in sorted(kinds)]
     return _about(found) | {
-        "results": _table((*head, "causes by `diagnose`"), lines, 2),
+        "results": _table(head, lines, 2),
         "worlds": _table(("world", "chance", "states", "steps of the optimum", *named), places, 2),
-        "figure": _map(kinds, figures) if found else "",
     }
-
-
-def _scaled(group: Group) -> np.ndarray:
-    """(n,), the last regret as a share of the optimum's absolute value, at most 1."""
-    scale = abs(group.world.evaluator.optimal_value)
-    return np.minimum([row.regret / scale for row in group.rows], 1.0)
-
-
-def _map(kinds: dict[tuple[str, str], list[Group]], figures: Path) -> str:
-    """Worlds by their size and the length of the optimum's episodes; diamonds have chance, circles none."""
-    with house_style("defaults"):
-        size = (3.4 * len(kinds) + 0.6, 3.0)
-        figure, axes = plt.subplots(1, len(kinds), figsize=size, layout="constrained", squeeze=False)
-        for axis, (kind, own) in zip(axes.flat, sorted(kinds.items()), strict=True):
-            for group in own:
-                length, share = group.world.evaluator.optimum.expected_length, group.certified
-                style = {"marker": "D" if group.world.mdp.is_stochastic else "o", "vmin": 0, "vmax": 1}
-                points = axis.scatter(
-                    length, group.world.mdp.num_states, c=share.count / share.total, **style
-                )
-            axis.set(title=" ".join(kind), xlabel="steps of the optimum", ylabel="states")
-            axis.set(xscale="log", yscale="log")
-        figure.colorbar(points, ax=axes, label="certified for good")
-        return _saved(figure, figures / "atlas_defaults.svg", "Worlds by size, and the share certified there")

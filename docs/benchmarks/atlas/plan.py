@@ -1,7 +1,5 @@
 """What is run: worlds, libraries with their pins, settings matched one by one."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.metadata
 import json
@@ -52,9 +50,8 @@ class World:
         names = ("next_state", "probability", "reward", "terminal", "start")
         arrays = {name: getattr(self.mdp, name) for name in names}
         arrays["observation"] = make_observation(self.mdp, "one_hot").table()
-        return {name: array.tolist() for name, array in arrays.items()} | {
-            "limit": self.mdp.max_episode_steps
-        }
+        limit = {"limit": self.mdp.max_episode_steps}
+        return limit | {name: array.tolist() for name, array in arrays.items()}
 
 
 def _world(name: str, env: str | None = None, **settings: Any) -> World:
@@ -62,11 +59,12 @@ def _world(name: str, env: str | None = None, **settings: Any) -> World:
 
 
 _SIX = (
-    *(_world("classic"), _world("frozen_lake", "frozen_lake_v1"), _world("cliff")),
-    *(_world("deep_sea_6", "deep_sea", size=6), _world("river_swim")),
+    *map(_world, ("classic", "cliff", "river_swim")),
+    _world("frozen_lake", "frozen_lake_v1"),
+    _world("deep_sea_6", "deep_sea", size=6),
     _world("cliff_20", "cliff", max_episode_steps=20),  # a penalty for every step, and few of them
 )
-_SHIPPED = "aima_4x3 cliff_walking combination_lock four_rooms frozen_lake_4x4 frozen_lake_8x8 maze"
+_MORE = "aima_4x3 cliff_walking combination_lock deep_sea four_rooms frozen_lake_4x4 frozen_lake_8x8 maze"
 
 
 def _random_maps() -> Iterator[World]:
@@ -89,8 +87,8 @@ def _random_maps() -> Iterator[World]:
 @cache
 def worlds_of(page: str) -> tuple[World, ...]:
     """The six worlds of `implementations`, or the forty of `defaults`."""
-    more = [_world(name) for name in [*_SHIPPED.split(), "random_walk", "taxi_v4"]]
-    return _SIX if page == "implementations" else (*_SIX, *more, _world("deep_sea"), *_random_maps())
+    more = map(_world, [*_MORE.split(), "random_walk", "taxi_v4"])
+    return _SIX if page == "implementations" else (*_SIX, *more, *_random_maps())
 
 
 class Library(NamedTuple):
@@ -114,10 +112,6 @@ LIBRARIES = {
         ("gymnasium==0.29.1", "numpy<2", "tyro", "tensorboard", _TORCH),
         ("https://github.com/vwxyzjn/cleanrl", "fe8d8a03c41a7ef5b523e2e354bd01c363e786bb"),
     ),
-}
-NOT_HERE = {
-    **dict.fromkeys(("Tianshou", "RLlib", "TorchRL"), "not tried yet"),
-    "Rejax": "not tried yet; its environments are written in JAX, so policies must be read in another way",
 }
 
 # Steps, and N. N does not divide a rollout of PPO, since the engine's curve is read before an update there.
@@ -147,28 +141,24 @@ CLEANRL = {
     "n_steps": "num_steps", "n_epochs": "update_epochs", "clip_range": "clip_coef",
 }
 # fmt: on
-# Where a library has no setting, what it does: (algorithm, subject) -> by library.
-FIXED: dict[tuple[str, str], dict[str, str]] = {
-    ("dqn", "loss"): {"sb3": "smooth L1", "engine": "smooth L1", "sbx": "?", "cleanrl": "squares"},
-    ("dqn", "gradient norm"): {"sb3": "at most 10", "engine": "at most 10", "sbx": "?", "cleanrl": "any"},
-    ("dqn", "net_arch"): {"cleanrl": "fixed, the same"},
-    ("ppo", "net_arch"): {"cleanrl": "fixed, the same"},
-    ("ppo", "batch_size"): {"cleanrl": "`num_minibatches` = 4"},
-    ("ppo", "value at a time limit"): {"sb3": "added", "engine": "added", "sbx": "?", "cleanrl": "0"},
-    ("q_learning", "of equal actions"): {"engine": "any", "plain": "any"},
-}
 
 
 def settings_of(library: str, algorithm: str) -> dict[str, Any]:
     """The matched settings by the library's own names."""
     own = dict(MATCHED[algorithm])
+    hidden = own.pop("net_arch", None)  # what the scripts of CleanRL have
     if library == "cleanrl":
-        own = {CLEANRL.get(name, name): value for name, value in own.items() if name != "net_arch"}
+        own = {CLEANRL.get(name, name): value for name, value in own.items()}
         if algorithm == "ppo":
             own["num_minibatches"] = own["num_envs"] * own["num_steps"] // own.pop("batch_size")
-            own |= {"anneal_lr": False, "clip_vloss": False, "norm_adv": True}
-    elif "net_arch" in own:
-        own["policy_kwargs"] = {"net_arch": own.pop("net_arch")}
+            own |= {
+                "anneal_lr": False,
+                "clip_vloss": False,
+                "vf_coef": 2 * own["vf_coef"],
+            }  # of half a square
+    elif hidden is not None:
+        is_sbx_ppo = (library, algorithm) == ("sbx", "ppo")
+        own["policy_kwargs"] = {"net_arch": hidden, **({"ortho_init": True} if is_sbx_ppo else {})}
     return own
 
 
@@ -208,18 +198,22 @@ class Job:
         return found | {"settings": settings, "commit": LIBRARIES[self.library].source[1]}
 
     @cached_property
+    def digest(self) -> str:
+        """Of settings, steps and the world's tables."""
+        text = json.dumps([self.content, self.world.tables], sort_keys=True).replace(str(ROOM), "")
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    @property
     def key(self) -> tuple[str, ...]:
         """What a row is known by: all that decides it."""
-        text = json.dumps([self.content, self.world.tables], sort_keys=True).replace(str(ROOM), "")
         named = (self.page, self.library, self.algorithm, self.world.name, str(self.seed))
-        return (*named, hashlib.sha256(text.encode()).hexdigest()[:12], versions(self.library))
+        return (*named, self.digest, versions(self.library))
 
 
 def python_of(library: str) -> Path:
     """The Python that has a library."""
-    if not LIBRARIES[library].pins:
-        return Path(sys.executable)
-    if not (python := ROOM / library / "bin" / "python").exists():
+    python = ROOM / library / "bin" / "python" if LIBRARIES[library].pins else Path(sys.executable)
+    if not python.exists():
         raise InputError(f"{library}: is not installed; run python docs/benchmarks/atlas install {library}")
     return python
 
@@ -228,8 +222,7 @@ def python_of(library: str) -> Path:
 def versions(library: str) -> str:
     """The versions of a library and of what decides its numbers."""
     named, _, pins, source = LIBRARIES[library]
-    places = [str(path) for path in (ROOM / library / "lib").glob("python*/site-packages")]
-    python_of(library)
+    places = [str(path) for path in python_of(library).parents[1].glob("lib/python*/site-packages")]
     found = {"gridworld": gridworld.__version__}  # which runs in a checkout
     for each in importlib.metadata.distributions(path=places if pins else sys.path):
         found.setdefault(each.metadata["Name"].replace("-", "_").lower(), each.version)

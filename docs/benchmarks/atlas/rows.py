@@ -1,16 +1,13 @@
 """Rows: workers are run, their policies scored exactly, and each result appended to one CSV, once."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os
 import statistics
 import subprocess
 import sys
-import tempfile
+import time
 from collections import defaultdict
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,11 +17,9 @@ from plan import LIBRARIES, ROOM, ROOT, Job, python_of
 
 from gridworld.base.errors import InputError
 from gridworld.world.chain import one_hot_policy
-from gridworld.world.evaluation import Score
 
 ROWS = ROOT / "docs" / "data" / "atlas.csv"
 KEY = 7  # fields by which a row is known
-_START = 5.0  # seconds until a worker trains
 
 
 class Row(NamedTuple):
@@ -39,16 +34,16 @@ class Row(NamedTuple):
     versions: str
     done: int  # environment steps
     every: int
-    seconds: float
+    seconds: float  # until the worker has ended
     certified_since: str  # the first evaluation after which no later one fails; "" where the last one does
     regret: float  # of the last policy
     cause: str  # why it is not certified, where `diagnose` was asked
-    curve: str  # "step:regret", with "*" where certified, wherever that changed
+    curve: str  # "step:regret" wherever it changed; where certified, "step:0*"
 
     def regrets(self) -> np.ndarray:
-        """The regret at each point of `grid`, certified ones as 0."""
+        """The regret at each point of `grid`."""
         points = [point.split(":") for point in self.curve.split()]
-        values = np.array([0.0 if text.endswith("*") else float(text) for _, text in points])
+        values = np.array([float(text.rstrip("*")) for _, text in points])
         places = np.searchsorted([int(step) for step, _ in points], grid(self.done, self.every), side="right")
         return values[places - 1]
 
@@ -68,9 +63,7 @@ def read(path: Path) -> list[Row]:
             found = list(csv.DictReader(file))
             lines = [{name: kinds.get(name, str)(row[name]) for name in Row._fields} for row in found]
         except (KeyError, TypeError, ValueError):
-            raise InputError(
-                f"{path}: has other columns or a line that is cut off; delete that line"
-            ) from None
+            raise InputError(f"{path}: has other columns or half a line; delete that line") from None
     return [Row(**line) for line in lines]
 
 
@@ -82,51 +75,39 @@ def append(path: Path, row: Row) -> None:
         csv.writer(file, lineterminator="\n").writerows(lines)
 
 
-def work(job: Job, **more: Any) -> Iterator[dict[str, Any]]:
+def work(job: Job, **more: Any) -> list[dict[str, Any]]:
     """The lines that a worker writes for a job; those with actions have their exact `score`."""
     task = {**job.content, "seed": job.seed, "world": job.world.tables, "room": str(ROOM), **more}
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
-    if job.content["library"] == "engine":
-        environment["PYTHONPATH"] = str(ROOT)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore", "PYTHONPATH": str(ROOT)}
     command = [str(python_of(job.library)), str(Path(__file__).with_name("adapters.py"))]
-    known: dict[str, Score] = {}
-    with tempfile.TemporaryFile("w+", encoding="utf-8") as errors, subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment
-    ) as process:  # fmt: skip
-        try:
-            assert process.stdin
-            assert process.stdout
-            process.stdin.write(json.dumps(task) + "\n")
-            process.stdin.close()
-            for line in map(json.loads, process.stdout):
-                if actions := line.pop("actions", None):
-                    if str(actions) not in known:
-                        policy = one_hot_policy(np.array(actions), job.world.mdp.num_actions)
-                        known[str(actions)] = job.world.evaluator.score(policy)
-                    score = line["score"] = known[str(actions)]
-                    line |= {"regret": score.regret, "certified": score.certified}
-                yield line
-            if process.wait():
-                errors.seek(0)
-                last = (errors.read().strip() or "it ended without a word").splitlines()[-1]
-                raise InputError(f"{' '.join(job.key[1:5])}: {last}")
-        finally:
-            process.kill()
+    done = subprocess.run(command, input=json.dumps(task), capture_output=True, text=True, env=environment)
+    if done.returncode:
+        last = (done.stderr.strip() or "it ended without a word").splitlines()[-1]
+        raise InputError(f"{' '.join(job.key[1:5])}: {last}")
+    lines, known = [json.loads(line) for line in done.stdout.splitlines()], {}
+    for line in lines:
+        if actions := tuple(line.pop("actions", ())):
+            if actions not in known:
+                policy = one_hot_policy(np.array(actions), job.world.mdp.num_actions)
+                known[actions] = job.world.evaluator.score(policy)
+            score = line["score"] = known[actions]
+            line |= {"regret": score.regret, "certified": score.certified}
+    return lines
 
 
 def run(job: Job) -> Row:
     """Train a job, and make a row of it."""
-    curve, since, before, last = [], "", "", {"cause": ""}
+    curve, since, before, last, started = [], "", "", {"cause": ""}, time.perf_counter()
     for line in work(job):
         last |= line
         if "regret" in line:
             since = (since or str(line["step"])) if line["certified"] else ""
-            text = f"{line['regret']:.9g}{'*' if line['certified'] else ''}"
+            text = "0*" if line["certified"] else f"{line['regret']:.9g}"
             curve += [f"{line['step']}:{text}"] if text != before else []
             before = text
-    regret = 0.0 if since else float(f"{last['regret']:.9g}")
-    rest = (job.content["every"], round(last["seconds"], 1), since, regret, last["cause"], " ".join(curve))
-    return Row(*job.key, last["step"], *rest)
+    seconds, regret = round(time.perf_counter() - started, 1), float(before.rstrip("*"))
+    rest = last["step"], job.content["every"], seconds, since, regret, last["cause"], " ".join(curve)
+    return Row(*job.key, *rest)
 
 
 def missing(jobs: list[Job], path: Path) -> list[Job]:
@@ -139,7 +120,7 @@ def estimate(jobs: list[Job], path: Path, processes: int) -> str:
     """How long the jobs take, by the rows that are there."""
     seconds = defaultdict(list)
     for row in read(path):
-        seconds[row.page, row.library, row.algorithm].append(row.seconds + _START)
+        seconds[row.page, row.library, row.algorithm].append(row.seconds)
     kinds = [(job.page, job.library, job.algorithm) for job in jobs]
     known = [statistics.median(seconds[kind]) for kind in kinds if kind in seconds]
     unknown = ", ".join(sorted({" ".join(kind[1:]) for kind in kinds if kind not in seconds}))
