@@ -171,8 +171,8 @@ def test_stable_baselines3_and_the_engine(
     [world] = [each for each in atlas.plan.worlds_of("implementations") if each.name == "frozen_lake"]
     for row in found:
         assert (row.done, row.every) == (2500, 1000)
-        regrets = row.regrets()
-        assert regrets.shape == (4,)  # 0, 1000, 2000, 2500
+        steps, regrets = row.points()
+        assert steps.tolist() == [0, 1000, 2000, 2500]
         assert regrets[-1] == row.regret
         assert ((regrets >= 0) & (regrets <= world.evaluator.optimal_value)).all()
         assert "torch" in row.versions

@@ -23,8 +23,7 @@ from gridworld.base.errors import InputError
 
 def main(words: list[str]) -> None:
     """Do what the command line says."""
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("atlas", description=__doc__, formatter_class=raw)
+    parser = argparse.ArgumentParser("atlas", usage=__doc__)
     option = parser.add_argument
     pages = ("implementations", "defaults")
     option("what", choices=("install", *pages, "draw", "check", "repeat"))
@@ -54,8 +53,9 @@ def main(words: list[str]) -> None:
         repeat(rows.read(options.rows), options.seeds or 5)
     else:
         seeds = options.seeds or {"implementations": 50, "defaults": 20}[options.what]
+        there = {row[: plan.KEY] for row in rows.read(options.rows)}
         wanted = plan.jobs(options.what, libraries, options.algorithms, options.worlds, seeds)
-        todo = rows.missing(wanted, options.rows)
+        todo = [job for job in wanted if job.key not in there]
         if options.estimate:
             print(rows.estimate(todo, options.rows, options.jobs))
         elif failed := rows.run_all(todo, options.rows, options.jobs):
@@ -78,7 +78,7 @@ def check(job: plan.Job) -> None:
 
 def repeat(found: list[rows.Row], count: int) -> None:
     """Train some rows, drawn at random, again from nothing."""
-    known = {row[: rows.KEY]: row for row in found}
+    known = {row[: plan.KEY]: row for row in found}
     libraries, seeds = sorted({row.library for row in found}), 1 + max(int(row.seed) for row in found)
     every = [
         plan.jobs(page, libraries, list(plan.MATCHED), [], seeds) for page in {row.page for row in found}

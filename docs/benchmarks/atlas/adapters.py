@@ -164,9 +164,6 @@ def play(what: dict[str, Any], greedy: Greedy) -> dict[str, float]:
     return {"played": float(np.mean(returns)), "error": float(np.std(returns, ddof=1) / len(returns) ** 0.5)}
 
 
-ADAPTERS = {"sb3": sb3_like, "sbx": sb3_like, "cleanrl": cleanrl, "engine": engine, "plain": plain}
-
-
 def main() -> None:
     """One job, from standard input to standard output, on which a library may not print."""
     job, out = json.load(sys.stdin), sys.stdout
@@ -175,7 +172,8 @@ def main() -> None:
     gym.register("Atlas-v0", max_episode_steps=job["world"]["limit"], **made)
     with tempfile.TemporaryDirectory() as place:
         os.chdir(place)  # where CleanRL writes runs/
-        saved = ADAPTERS[job["library"]](job, reader)
+        learn = {"sb3": sb3_like, "sbx": sb3_like, "cleanrl": cleanrl, "engine": engine, "plain": plain}
+        saved = learn[job["library"]](job, reader)
         reader.read()
         if "play" in job and saved is not None:
             reader.write(**play(job["play"], saved(f"{place}/model")))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 from plan import CLEANRL, LIBRARIES, MARGIN, MATCHED, ROOT, Job, World, worlds_of
-from rows import Row, grid
+from rows import Row
 from scipy import stats
 
 from gridworld.report import statistics
@@ -19,8 +19,7 @@ from gridworld.report.chart import compact, house_style, styles
 
 SEED = 0  # of the bootstrap
 _LEVEL = 0.05  # of each one-sided test
-_FEW, _PLANNED = 10, 50
-_DOCS = ROOT / "docs"
+_FEW = 10  # seeds, with fewer of which nothing is concluded
 _TWO = "{:.2f}".format
 _SHOWN = ("certified for good", "median steps to it", "regret at the end", "a run takes")
 
@@ -71,8 +70,7 @@ def compare(first: Group, second: Group) -> Comparison:
     least, both = min(len(first.rows), len(second.rows)), (first.steps, second.steps)
     curves = {row.seed: (row.curve, row.done) for row in first.rows}
     identical = sum(curves.get(row.seed) == (row.curve, row.done) for row in second.rows)
-    is_whole = bool(np.isfinite(np.concatenate(both)).all()) and least > 1
-    ratio, p = equivalence(*both) if is_whole else (None, None)
+    ratio, p = equivalence(*both) if least > 1 and np.isfinite(np.concatenate(both)).all() else (None, None)
     apart = ratio or statistics.difference(first.certified, second.certified)
     is_apart = apart.low > (ratio is not None) or apart.high < (ratio is not None)  # than 1, than 0
     verdict = "differ" if is_apart else "undecided"
@@ -102,16 +100,18 @@ def caution(found: Sequence[Group]) -> str:
     """How much so many seeds allow to say."""
     counts = sorted(len(group.rows) for group in found) or [0]
     number = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1])))) + " seeds"
-    few = ": a smoke test, no claim" if counts[0] < _FEW else ": a first look"
-    return f"**{number}{few if counts[0] < _PLANNED else ''}.**"
+    return f"**{number}{': a smoke test, no claim' if counts[0] < _FEW else ''}.**"
 
 
-def draw(rows: list[Row], docs: Path = _DOCS) -> None:
+def draw(rows: list[Row], docs: Path = ROOT / "docs") -> None:
     """Fill both pages."""
     for page, blocks in (("implementations", _implementations), ("defaults", _defaults)):
         file = docs / "reference" / f"{page}.md"
         text = file.read_text("utf-8")
-        for name, block in blocks(groups(rows, page), docs / "data").items():
+        found = groups(rows, page)
+        versions = sorted({f"- `{group.library}`: {group.rows[0].versions}" for group in found})
+        shared = {"caution": caution(found), "versions": "\n".join(versions) or "No rows yet."}
+        for name, block in {**shared, **blocks(found, docs / "data")}.items():
             before, mark, rest = text.partition(f"<!-- atlas: {name} -->\n")
             text = f"{before}{mark}\n{block}\n\n{rest[rest.index('<!-- end -->') :]}"
         file.write_text(text, encoding="utf-8")
@@ -133,12 +133,6 @@ def _number(value: float) -> str:
 def _interval(found: statistics.Interval, text: Callable[[float], str] = _number) -> str:
     bounds = "" if math.isnan(found.low) else f" ({text(found.low)} to {text(found.high)})"
     return text(found.point) + bounds
-
-
-def _about(found: Sequence[Group]) -> dict[str, str]:
-    """Caution and versions, which both pages have."""
-    versions = sorted({f"- `{group.library}`: {group.rows[0].versions}" for group in found})
-    return {"caution": caution(found), "versions": "\n".join(versions) or "No rows yet."}
 
 
 def _seconds(found: Sequence[Group]) -> str:
@@ -168,7 +162,7 @@ def _implementations(found: list[Group], figures: Path) -> dict[str, str]:
         for algorithm, matched in MATCHED.items()
         for name, value in matched.items()
     ]
-    return _about(found) | {
+    return {
         "settings": _table(("algorithm", "setting", "value", "CleanRL's name for it"), settings, 2),
         "results": _table((*named, *_SHOWN), lines),
         "pairs": _table((*named[:2], "pair", "verdict", *tested), pairs, 4),
@@ -182,17 +176,16 @@ def _curves(algorithm: str, found: Sequence[Group], figures: Path) -> str:
     worlds, drawn = list(dict.fromkeys(group.world.name for group in own)), styles(list(LIBRARIES))
     down, across = -(-len(worlds) // 3), min(3, len(worlds))
     with house_style(algorithm):
-        size = (3.2 * across + 0.6, 2.4 * down + 0.6)
-        figure, axes = plt.subplots(down, across, figsize=size, layout="constrained", squeeze=False)
+        shape = {"figsize": (3.2 * across + 0.6, 2.4 * down + 0.6), "layout": "constrained"}
+        figure, axes = plt.subplots(down, across, squeeze=False, **shape)
         handles = {}
         for axis, world in itertools.zip_longest(axes.flat, worlds):
             axis.set_visible(world is not None)
             axis.set(title=world, xlabel="steps", ylabel="regret")
             axis.xaxis.set_major_formatter(compact)
             for group in (each for each in own if each.world.name == world):
-                regrets = np.stack([row.regrets() for row in group.rows], axis=1)
-                steps = grid(group.rows[0].done, group.rows[0].every)
-                point, low, high = statistics.bands(statistics.iqm, [regrets], SEED)
+                (steps, *_), regrets = zip(*(row.points() for row in group.rows), strict=True)
+                point, low, high = statistics.bands(statistics.iqm, [np.stack(regrets, axis=1)], SEED)
                 [handles[group.library]] = axis.plot(steps, point, **drawn[group.library])
                 axis.fill_between(steps, low, high, alpha=0.2, color=drawn[group.library]["color"], lw=0)
         figure.legend(handles.values(), handles, loc="outside upper left", ncols=len(handles))
@@ -227,7 +220,7 @@ def _defaults(found: list[Group], figures: Path) -> dict[str, str]:
         for world, by_kind in worlds.items()
     ]
     named = [" ".join(kind) for kind in sorted(kinds)]
-    return _about(found) | {
+    return {
         "results": _table(head, lines, 2),
         "worlds": _table(("world", "chance", "states", "steps of the optimum", *named), places, 2),
     }

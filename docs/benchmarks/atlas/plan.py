@@ -22,6 +22,7 @@ from gridworld.world.mdp import Mdp
 
 ROOT = Path(__file__).parents[3]
 ROOM = Path(os.environ.get("ATLAS_ROOM", ROOT / "runs" / "atlas"))  # virtual environments and maps
+KEY = 7  # fields by which a row is known: `Job.key`
 GAMMA = 0.99
 # Implementations are called equal where the ratio of their geometric mean steps is within 4/5 to 5/4: the
 # bounds by which generic medicines are judged (FDA, 2001). It was set before any row was run.
@@ -92,26 +93,22 @@ def worlds_of(page: str) -> tuple[World, ...]:
 
 
 class Library(NamedTuple):
-    """A library: here, or where it has pins, in a virtual environment of its own."""
+    """A library: here, or where it has pins, in a virtual environment of its own. Texts are words."""
 
-    named: tuple[str, ...]  # distributions whose versions a row has
-    algorithms: tuple[str, ...]
-    pins: tuple[str, ...] = ()
+    named: str  # distributions whose versions a row has
+    algorithms: str
+    pins: str = ""
     source: tuple[str, str] = ("", "")  # a repository and the commit that is fetched next to it
 
 
-_TORCH = "torch==2.13.0"
+_OLD = "gymnasium==0.29.1 numpy==1.26.4 tyro==1.0.17 tensorboard==2.20.0 torch==2.13.0"
+_CLEANRL = ("https://github.com/vwxyzjn/cleanrl", "fe8d8a03c41a7ef5b523e2e354bd01c363e786bb")
 LIBRARIES = {
-    "sb3": Library(("stable_baselines3", "torch", "gymnasium", "numpy"), ("dqn", "ppo", "a2c")),
-    "engine": Library(("gridworld", "torch", "numpy"), ("dqn", "ppo", "a2c", "q_learning")),
-    "plain": Library(("gymnasium", "numpy"), ("q_learning",)),
-    "sbx": Library(("sbx_rl", "jax", "flax", "gymnasium"), ("dqn", "ppo"), ("sbx-rl==0.28.0", _TORCH)),
-    "cleanrl": Library(
-        ("torch", "gymnasium", "numpy"),
-        ("dqn", "ppo"),
-        ("gymnasium==0.29.1", "numpy<2", "tyro", "tensorboard", _TORCH),
-        ("https://github.com/vwxyzjn/cleanrl", "fe8d8a03c41a7ef5b523e2e354bd01c363e786bb"),
-    ),
+    "sb3": Library("stable_baselines3 torch gymnasium numpy", "dqn ppo a2c"),
+    "engine": Library("gridworld torch numpy", "dqn ppo a2c q_learning"),
+    "plain": Library("gymnasium numpy", "q_learning"),
+    "sbx": Library("sbx_rl jax flax", "dqn ppo", "sbx-rl==0.28.0 jax==0.10.2 flax==0.12.8 torch==2.13.0"),
+    "cleanrl": Library("torch gymnasium numpy", "dqn ppo", _OLD, _CLEANRL),
 }
 
 # Steps, and N. N does not divide a rollout of PPO, since the engine's curve is read before an update there.
@@ -227,7 +224,7 @@ def versions(library: str) -> str:
     for each in importlib.metadata.distributions(path=places if pins else sys.path):
         found.setdefault(each.metadata["Name"].replace("-", "_").lower(), each.version)
     commit = [f"commit {source[1][:8]}"] if source[1] else []
-    return ", ".join([*(f"{name} {found[name]}" for name in named), *commit])
+    return ", ".join([*(f"{name} {found[name]}" for name in named.split()), *commit])
 
 
 def jobs(page: str, libraries: list[str], algorithms: list[str], worlds: list[str], seeds: int) -> list[Job]:
@@ -241,6 +238,6 @@ def jobs(page: str, libraries: list[str], algorithms: list[str], worlds: list[st
         for name in worlds or known
         for algorithm in algorithms
         for library in libraries
-        if algorithm in LIBRARIES[library].algorithms
+        if algorithm in LIBRARIES[library].algorithms.split()
         if page == "implementations" or library not in ("engine", "plain")
     ]

@@ -19,7 +19,6 @@ from gridworld.base.errors import InputError
 from gridworld.world.chain import one_hot_policy
 
 ROWS = ROOT / "docs" / "data" / "atlas.csv"
-KEY = 7  # fields by which a row is known
 
 
 class Row(NamedTuple):
@@ -40,17 +39,12 @@ class Row(NamedTuple):
     cause: str  # why it is not certified, where `diagnose` was asked
     curve: str  # "step:regret" wherever it changed; where certified, "step:0*"
 
-    def regrets(self) -> np.ndarray:
-        """The regret at each point of `grid`."""
-        points = [point.split(":") for point in self.curve.split()]
-        values = np.array([float(text.rstrip("*")) for _, text in points])
-        places = np.searchsorted([int(step) for step, _ in points], grid(self.done, self.every), side="right")
-        return values[places - 1]
-
-
-def grid(done: int, every: int) -> np.ndarray:
-    """The steps at which a policy is read."""
-    return np.unique([*range(0, done, every), done])
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """The steps at which its policy was read, and the regret there."""
+        steps = np.unique([*range(0, self.done, self.every), self.done])
+        changes = [point.split(":") for point in self.curve.split()]
+        places = np.searchsorted([int(step) for step, _ in changes], steps, side="right") - 1
+        return steps, np.array([float(text.rstrip("*")) for _, text in changes])[places]
 
 
 def read(path: Path) -> list[Row]:
@@ -110,12 +104,6 @@ def run(job: Job) -> Row:
     return Row(*job.key, *rest)
 
 
-def missing(jobs: list[Job], path: Path) -> list[Job]:
-    """The jobs of which there is no row."""
-    there = {row[:KEY] for row in read(path)}
-    return [job for job in jobs if job.key not in there]
-
-
 def estimate(jobs: list[Job], path: Path, processes: int) -> str:
     """How long the jobs take, by the rows that are there."""
     seconds = defaultdict(list)
@@ -153,7 +141,7 @@ def install(library: str) -> None:
     """
     folder, (_, _, pins, (address, commit)) = ROOM / library, LIBRARIES[library]
     subprocess.run([sys.executable, "-m", "venv", folder], check=True)
-    subprocess.run([folder / "bin" / "python", "-m", "pip", "install", "-q", *pins], check=True)
+    subprocess.run([folder / "bin" / "python", "-m", "pip", "install", "-q", *pins.split()], check=True)
     if address and not (folder / "source").exists():
         address = os.environ.get("ATLAS_SOURCE", address)
         subprocess.run(["git", "clone", "-q", "-n", address, folder / "source"], check=True)
