@@ -101,7 +101,7 @@ class Library(NamedTuple):
     source: tuple[str, str] = ("", "")  # a repository and the commit that is fetched next to it
 
 
-_OLD = "gymnasium==0.29.1 numpy==1.26.4 tyro==1.0.17 tensorboard==2.20.0 torch==2.13.0"
+_OLD = "gymnasium==0.29.1 numpy==1.26.4 tyro==1.0.17 tensorboard==2.21.0 torch==2.13.0"
 _CLEANRL = ("https://github.com/vwxyzjn/cleanrl", "fe8d8a03c41a7ef5b523e2e354bd01c363e786bb")
 LIBRARIES = {
     "sb3": Library("stable_baselines3 torch gymnasium numpy", "dqn ppo a2c"),
