@@ -119,7 +119,7 @@ def test_the_pages_are_what_their_rows_give(atlas: Any, tmp_path: Path) -> None:
 def test_workers_step_as_the_world_does(atlas: Any, name: str) -> None:
     """The mean of many steps from every state is what the tables say; the clock reads every N steps."""
     [world] = [each for each in atlas.plan.worlds_of("implementations") if each.name == name]
-    tables = json.loads(json.dumps(world.tables))
+    tables = json.loads(world.tables)
     lines: list[dict[str, Any]] = []
     reader = atlas.adapters.Reader({"every": 7, "steps": 50, "world": tables}, None)
     reader.write = lambda **line: lines.append(line)

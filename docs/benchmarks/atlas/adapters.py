@@ -167,6 +167,7 @@ def play(what: dict[str, Any], greedy: Greedy) -> dict[str, float]:
 def main() -> None:
     """One job, from standard input to standard output, on which a library may not print."""
     job, out = json.load(sys.stdin), sys.stdout
+    job["world"] = json.loads(job["world"])
     sys.stdout, reader = sys.stderr, Reader(job, out)
     made = {"entry_point": lambda: TableEnv(job["world"], reader), "disable_env_checker": True}
     gym.register("Atlas-v0", max_episode_steps=job["world"]["limit"], **made)

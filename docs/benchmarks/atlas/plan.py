@@ -46,13 +46,13 @@ class World:
         return Evaluator(self.mdp, GAMMA, self.mdp.max_episode_steps)
 
     @cached_property
-    def tables(self) -> dict[str, Any]:
-        """What a worker makes its environment of."""
+    def tables(self) -> str:
+        """What a worker makes its environment of, as JSON."""
         names = ("next_state", "probability", "reward", "terminal", "start")
         arrays = {name: getattr(self.mdp, name) for name in names}
         arrays["observation"] = make_observation(self.mdp, "one_hot").table()
         limit = {"limit": self.mdp.max_episode_steps}
-        return limit | {name: array.tolist() for name, array in arrays.items()}
+        return json.dumps(limit | {name: array.tolist() for name, array in arrays.items()})
 
 
 def _world(name: str, env: str | None = None, **settings: Any) -> World:
@@ -197,7 +197,7 @@ class Job:
     @cached_property
     def digest(self) -> str:
         """Of settings, steps and the world's tables."""
-        text = json.dumps([self.content, self.world.tables], sort_keys=True).replace(str(ROOM), "")
+        text = json.dumps(self.content, sort_keys=True).replace(str(ROOM), "") + self.world.tables
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     @property
