@@ -45,7 +45,7 @@ class Levels:
         live = np.flatnonzero(~mdp.absorbing)
         self._order: IntArray = live[np.argsort(steps[live], kind="stable")]
         # Where an episode is over is one, behind the last.
-        self._rank = np.full(mdp.num_states, len(live), dtype=np.int32)
+        self._rank = np.full(mdp.num_states, len(live))
         self._rank[self._order] = np.arange(len(live))
         self._num_states = mdp.num_states
         self._following = self._rank[mdp.next_state[self._order]]  # (n, A, K)
@@ -80,7 +80,7 @@ class Levels:
             np.repeat(np.arange(len(counts)), counts),
             np.arange(ordered.nnz) - np.repeat(ordered.indptr[:-1], counts),
         )
-        following = np.zeros((len(counts), counts.max()), dtype=np.int32)
+        following = np.zeros((len(counts), counts.max()), dtype=np.int64)
         weight = np.zeros(following.shape)
         following[place], weight[place] = self._rank[ordered.indices], gamma * ordered.data
         paid, near = paid[self._order][:, None], near[self._order]
@@ -126,10 +126,10 @@ class Levels:
                 flags[level] = 0
                 part = slice(edges[level], edges[level + 1])
                 if known[level] < _COMPARED or paid.shape[1] == 1:
-                    new = pays[part] + np.einsum("nk,nk->n", weighs[part], x[follows[part]])
+                    new = pays[part] + np.einsum("nk,nk->n", weighs[part], x.take(follows[part]))
                     known[level] += 1
                 else:
-                    q = paid[part] + np.einsum("nak,nak->na", weight[part], x[following[part]])
+                    q = paid[part] + np.einsum("nak,nak->na", weight[part], x.take(following[part]))
                     best = rows[part], q.argmax(axis=1)
                     follows[part], weighs[part], pays[part] = following[best], weight[best], paid[best]
                     new, known[level] = q.max(axis=1), 1
