@@ -37,16 +37,17 @@ def atlas(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Any]:
         del sys.modules[name]
 
 
-def _rows(atlas: Any, library: str, steps: list[float], world: str = "classic") -> list[Any]:
+def _rows(
+    atlas: Any, library: str, steps: list[float], page: str = "implementations", world: str = "classic"
+) -> list[Any]:
     """Rows of runs that are certified for good at these steps; infinity is never."""
+    jobs = atlas.plan.jobs(page, [library], ["dqn"], [world], len(steps))
     made = []
-    for job, since in zip(
-        atlas.plan.jobs("implementations", [library], ["dqn"], [world], 99), steps, strict=False
-    ):
+    for job, since in zip(jobs, steps, strict=True):
         is_certified = np.isfinite(since)
         curve = f"0:0.9 {since:.0f}:0*" if is_certified else "0:0.9"
-        end = (f"{since:.0f}", 0.0) if is_certified else ("", 0.9)
-        made.append(atlas.rows.Row(*job.key, 30_000, 1000, 60.0, *end, "", curve))
+        end = (f"{since:.0f}", 0.0, "") if is_certified else ("", 0.9, "slow")
+        made.append(atlas.rows.Row(*job.key, 30_000, 1000, 60.0, *end, curve))
     return made
 
 
@@ -102,6 +103,18 @@ def test_a_page_says_how_little_it_knows(atlas: Any, tmp_path: Path) -> None:
     assert (tmp_path / "reference" / "implementations.md").read_text("utf-8") == text
     old = [row._replace(digest="of other settings") for row in found]
     assert atlas.pages.groups(old, "implementations") == []
+
+
+def test_defaults_have_their_causes_and_worlds(atlas: Any, tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    found = _rows(atlas, "sb3", [9000.0, np.inf, np.inf], "defaults")
+    found += _rows(atlas, "sb3", [9000.0, 9000.0, np.inf], "defaults", "map_4_0_slip")
+    blocks = atlas.pages._defaults(atlas.pages.groups(found, "defaults"), tmp_path / "data")
+    assert "| sb3 | dqn | 2 | 6 | 3 of 6 (19% to 81%) |" in blocks["results"]
+    assert blocks["results"].endswith("| 60 s | slow 3 |")
+    assert "| classic | no | 30 | 8.0 | 1 of 3 (6% to 79%) |" in blocks["worlds"]
+    assert "| map_4_0_slip | yes | 16 |" in blocks["worlds"]
+    assert len(atlas.plan.worlds_of("defaults")) == 40
 
 
 def test_the_pages_are_what_their_rows_give(atlas: Any, tmp_path: Path) -> None:

@@ -204,7 +204,7 @@ def _defaults(found: list[Group], figures: Path) -> dict[str, str]:
         each = [row for group in own for row in group.rows]
         share = statistics.share(sum(bool(row.certified_since) for row in each), len(each))
         scales = [abs(group.world.evaluator.optimal_value) for group in own]
-        shares = [np.minimum([row.regret for row in g.rows] / s, 1) for g, s in zip(own, scales, strict=True)]
+        shares = [np.minimum([row.regret / s for row in g.rows], 1) for g, s in zip(own, scales, strict=True)]
         regret = statistics.interval(statistics.mean, shares, SEED)
         causes = Counter(row.cause for row in each if row.cause).most_common()
         why = ", ".join(f"{cause} {count}" for cause, count in causes)
