@@ -26,6 +26,7 @@ from gridworld.commands import export
 from gridworld.report.export.exported_run import read
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import parse
+from gridworld.world.sources.arrays import world_bytes
 from gridworld.world.sources.storm import drn_lines
 
 NAME, TABLE = "dqn-classic-seed0", "q_learning-classic-seed3"
@@ -335,8 +336,8 @@ def as_read(run: Path, copies: Path) -> dict[str, bytes]:
     """The files that any target would get."""
     copies.mkdir()
     found = read(run, copies)
-    assert found.world is not None
-    return {path.name: path.read_bytes() for path in (*found.models, *found.pictures, found.world)}
+    files = {path.name: path.read_bytes() for path in (*found.models, *found.pictures)}
+    return files | {"world.npz": world_bytes(found.mdp)}
 
 
 def test_only_what_the_manifest_vouches_for_is_exported(lake: Path, tmp_path: Path) -> None:
