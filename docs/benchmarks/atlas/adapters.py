@@ -2,9 +2,8 @@
 
 It runs in that library's Python, a process for each row, and needs nothing of this package but for `engine`.
 It reads a job as JSON and writes a line of it, {"step": 1000, "actions": [...]}, for each point of the curve.
-The world is tables that the job brings; `gym.make("Atlas-v0")` makes it, with Gymnasium's own step limit and
-one-hot observations. The environment reads the policies: before the step that follows every N steps it asks
-for the actions in all states, so that a library's loop is untouched.
+`gym.make("Atlas-v0")` makes the job's tables an environment, with one-hot observations. It reads the policy
+in every N-th step, before the update after it, as the engine's curve does; a library's loop is untouched.
 """
 
 import importlib
@@ -33,11 +32,13 @@ class Reader:
         self.count = 0
         self.greedy: Greedy | None = None  # set by an adapter, before the first step
 
-    def before_step(self) -> None:
-        """Read the policy where it is due; the last one is read after the last update."""
-        if self.count % self._every == 0 and self.count < self._steps:
+    def step(self) -> None:
+        """Read the policy where it is due, before a library learns from this step; the last one after all."""
+        if self.count == 0:
             self.read()
         self.count += 1
+        if self.count % self._every == 0 and self.count < self._steps:
+            self.read()
 
     def read(self) -> None:
         if self.greedy is not None:
@@ -63,7 +64,7 @@ class TableEnv(gym.Env):
         return self._reader.rows[self._state].copy(), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        self._reader.before_step()
+        self._reader.step()
         state, action = self._state, int(action)
         outcome = bisect_right(self._outcomes[state][action], self.np_random.random())
         self._state = self._world["next_state"][state][action][outcome]

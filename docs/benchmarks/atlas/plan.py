@@ -111,7 +111,7 @@ LIBRARIES = {
     "cleanrl": Library("torch gymnasium numpy", "dqn ppo", _OLD, _CLEANRL),
 }
 
-# Steps, and N. N does not divide a rollout of PPO, since the engine's curve is read before an update there.
+# Steps, and N, of which the number of environments is a divisor.
 LENGTHS = {"dqn": (30_000, 1000), "ppo": (51_200, 1000), "a2c": (50_000, 1000), "q_learning": (10_000, 250)}
 DEFAULTS = (100_000, 5000)
 _EPSILON = {"exploration_initial_eps": 1.0, "exploration_final_eps": 0.05}
