@@ -21,6 +21,7 @@ from gridworld.examining.seen import Seen
 from gridworld.world.door.attributes import differing, held_by, is_plain
 from gridworld.world.door.beliefs import summed
 from gridworld.world.door.counters import counted
+from gridworld.world.door.known import state_reader
 from gridworld.world.door.search import Search, State
 from gridworld.world.mdp import BoolArray, IntArray
 from gridworld.world.shown import content
@@ -68,8 +69,11 @@ def pays_totals(seen: Seen) -> bool:
 
 def _by_states(seen: Seen) -> tuple[str, str] | None:
     """Compare the outcomes in states that show the same, exactly, and what tells these states apart."""
+    env = seen.make()
+    if state_reader(env.unwrapped) is not None:  # what the rules of a game hide belongs to it
+        return None
     bounds: Any = {"most_states": _MOST_STATES, "most_seconds": _SECONDS}
-    search = Search("env", seen.make(), **bounds, compares=False, keeps_copies=True)
+    search = Search("env", env, **bounds, compares=False, keeps_copies=True)
     try:
         search.explore()
     except Exception:  # its code may be anybody's

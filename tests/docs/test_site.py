@@ -26,7 +26,7 @@ PAGES = (  # by what may be too wide: pictures, tables, long commands, tables of
     "reference/api",
     "course/lab1_values",
 )
-PICTURES = ("faq", "how-to/runs", "index", "tutorials/quickstart", "tutorials/standing-still")
+PICTURES = ("faq", "how-to/runs", "tutorials/quickstart", "tutorials/standing-still")
 
 
 @pytest.fixture(scope="module")
