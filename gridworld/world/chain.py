@@ -208,10 +208,7 @@ class Chain:
         if levels.are_enough(self.mdp, gamma):
             with suppress(levels.NotConvergedError):
                 for column, counted in zip(sums.T, right.T, strict=True):
-                    nothing = np.zeros(len(counted))
-                    column[:] = levels.of(self.mdp).sums(
-                        self.transition, counted, nothing, gamma, levels.ACCURATE
-                    )
+                    column[:] = levels.of(self.mdp).sums(self.transition, counted, gamma)
                 return sums
         states = np.flatnonzero(playing)
         if states.size:

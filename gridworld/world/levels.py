@@ -44,10 +44,8 @@ class Levels:
         steps[steps < 0] = steps.max() + 1
         live = np.flatnonzero(~mdp.absorbing)
         self._order: IntArray = live[np.argsort(steps[live], kind="stable")]
-        # Where an episode is over is one, behind the last.
-        self._rank = np.full(mdp.num_states, len(live))
+        self._rank = np.full(mdp.num_states, len(live))  # what is over is one place, behind the last
         self._rank[self._order] = np.arange(len(live))
-        self._num_states = mdp.num_states
         self._following = self._rank[mdp.next_state[self._order]]  # (n, A, K)
         self._probability = mdp.probability[self._order]
         self._paid = np.einsum("nak,nak->na", self._probability, mdp.reward[self._order])
@@ -68,10 +66,15 @@ class Levels:
 
     def optimum(self, gamma: float, tolerance: float, most: int) -> FloatArray:
         """V* (S,), by sweeps from 0; see `_swept`."""
-        return self._swept(self._following, gamma * self._probability, self._paid, None, tolerance, most)
+        return self._swept(self._following, gamma * self._probability, self._paid, tolerance, most)
 
     def sums(
-        self, transition: Any, paid: FloatArray, near: FloatArray, gamma: float, tolerance: float
+        self,
+        transition: Any,
+        paid: FloatArray,
+        gamma: float,
+        tolerance: float = ACCURATE,
+        near: FloatArray | None = None,
     ) -> FloatArray:
         """x (S,) with x = paid + γ P_π x, of a scipy CSR array P_π (S, S), from `near` (S,); see `_swept`."""
         ordered = transition[self._order]
@@ -83,17 +86,17 @@ class Levels:
         following = np.zeros((len(counts), counts.max()), dtype=np.int64)
         weight = np.zeros(following.shape)
         following[place], weight[place] = self._rank[ordered.indices], gamma * ordered.data
-        paid, near = paid[self._order][:, None], near[self._order]
-        return self._swept(following[:, None], weight[:, None], paid, near, tolerance, MOST_SWEEPS)
+        paid, near = paid[self._order][:, None], None if near is None else near[self._order]
+        return self._swept(following[:, None], weight[:, None], paid, tolerance, MOST_SWEEPS, near)
 
     def _swept(
         self,
         following: IntArray,
         weight: FloatArray,
         paid: FloatArray,
-        near: FloatArray | None,
         tolerance: float,
         most: int,
+        near: FloatArray | None = None,
     ) -> FloatArray:
         """x (S,) with x(s) = max_a [ paid(s, a) + Σ_k weight(s, a, k) x(following(s, a, k)) ].
 
@@ -101,9 +104,9 @@ class Levels:
             following: (n, A, K), where outcomes lead, by this order.
             weight: (n, A, K), their discounted probabilities.
             paid: (n, A).
-            near: (n,), where to begin; None: at 0.
             tolerance: the relative change of a level that those who read it need not know of.
             most: sweeps of all states, or as many of some.
+            near: (n,), where to begin; None: at 0.
 
         Raises:
             NotConvergedError: values still change by more than that.
@@ -112,8 +115,9 @@ class Levels:
         x = np.zeros(len(paid) + 1)  # behind the last is 0
         if near is not None:
             x[:-1] = near
-        rows, first = np.arange(len(paid)), (following[:, 0].copy(), weight[:, 0].copy(), paid[:, 0].copy())
-        follows, weighs, pays = first  # of the action that was best when all were last compared
+        rows = np.arange(len(paid))
+        # Of the action that was best when all were last compared.
+        follows, weighs, pays = following[:, 0].copy(), weight[:, 0].copy(), paid[:, 0].copy()
         known = [_COMPARED] * num_levels  # sweeps since then
         moved = [0.0] * num_levels  # by how much no reader knows
         flags = bytearray(b"\1" * num_levels)
@@ -149,7 +153,7 @@ class Levels:
         return self._of_states(x)
 
     def _of_states(self, x: FloatArray) -> FloatArray:
-        found = np.zeros(self._num_states)
+        found = np.zeros(len(self._rank))
         found[self._order] = x[:-1]
         return found
 
@@ -160,7 +164,7 @@ def are_enough(mdp: Mdp, gamma: float) -> bool:
 
 
 def _paying_ends(mdp: Mdp) -> BoolArray:
-    """(S,), the ends that pay; if none does all ends, and without ends where the most is paid."""
+    """(S,), the ends that pay; all ends if none does; without ends, the states in which the most is paid."""
     possible = mdp.probability > 0
     ends = np.zeros(mdp.num_states, dtype=np.bool_)
     ends[mdp.next_state[possible & (mdp.reward > 0)]] = True

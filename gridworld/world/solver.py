@@ -42,8 +42,8 @@ from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup, st
 
 # Two actions whose values agree to this relative precision are equally good. Rounding stays far below it.
 TIE = 1e-9
-_SWEEP_TOLERANCE = 1e-9  # sweeps need only find a good policy; the rest is solved exactly
-_SWEEPS = 200
+# Sweeps need only find a good policy; the rest is solved exactly.
+_SWEEP_TOLERANCE, _SWEEPS = 1e-9, 200
 _IMPROVEMENT = 1e-11  # relative; less than that is rounding
 _PATIENT = 100.0  # steps; a longer horizon, 1 / (1 - γ), adds up more of what counts as a tie in one step
 _MOST_SOLUTIONS = 8  # of a world that are kept
@@ -141,7 +141,7 @@ def _solve_by_sweeps(mdp: Mdp, gamma: float) -> Solution:
     greedy = np.argmax(q, axis=1)
     paid = pick(np.einsum("sak,sak->sa", mdp.probability, np.abs(mdp.reward)), greedy)
     transition = Chain(mdp, one_hot_policy(greedy, mdp.num_actions)).transition
-    return _solution(mdp, gamma, v, q, levels.of(mdp).sums(transition, paid, np.abs(v), gamma, TIE))
+    return _solution(mdp, gamma, v, q, levels.of(mdp).sums(transition, paid, gamma, TIE, np.abs(v)))
 
 
 def _solve_by_value_and_slope(mdp: Mdp, gamma: float, greedy: IntArray) -> tuple[Evaluation, BoolArray]:

@@ -160,9 +160,9 @@ class Rejecting(Branching):
             number, self._num_drawn = self._num_drawn, self._num_drawn + 1
             is_as_before = self._place < len(self._decisions) and number < len(self._places)
             if not (is_as_before and self._places[number][2]):
-                way = self._place, tuple(self._taken[: self._place])
-                self._places[number:] = [(self._place_of(name), way, self._is_lasting)]
-                self._check_again(*self._places[-1])
+                place, way = self._place_of(name), (self._place, tuple(self._taken[: self._place]))
+                self._places[number:] = [(place, way, self._is_lasting)]
+                self._check_again(place, way)
             place, way, _ = self._places[number]
             if place is not None:
                 self._met[place] = way
@@ -172,7 +172,7 @@ class Rejecting(Branching):
         finally:
             self._depth -= 1
 
-    def _check_again(self, place: Any, way: Way, _: bool) -> None:
+    def _check_again(self, place: Any, way: Way) -> None:
         """Raise `_Again` if it is known what follows a draw that is made now."""
         if place is None:
             return

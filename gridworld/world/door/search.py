@@ -198,9 +198,8 @@ class Search:
         self.states: list[State] = []
         self.num_tried = 0
         self.ends: dict[bytes, known.Named] = {}  # what ends are called, by their observations
-        self._states: dict[
-            tuple[bytes, int], State
-        ] = {}  # by their cores, and by the time if there are clocks
+        # By their cores, and by the time if there are clocks.
+        self._states: dict[tuple[bytes, int], State] = {}
         self._rows: dict[Any, Any] = {}  # what follows in a core by an action, and where that holds
         self._cores: dict[bytes, State] = {}  # what states that differ in their clocks have in common
         self._reset_cores: set[bytes] = set()  # from which a reset was tried
