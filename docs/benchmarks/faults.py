@@ -2,13 +2,15 @@
 
     python docs/benchmarks/faults.py --results runs/faults.jsonl --seeds 5 --jobs 2
 
-trains every fault of `CATALOGUE` on three worlds and five seeds, and prints the tables of
-`docs/reference/faults.md`. What the file of results already has is not trained again.
+trains every fault of `CATALOGUE` on three worlds and five seeds, prints the tables of
+`docs/reference/faults.md`, and writes `docs/data/faults.csv`, a row for each fault. What the file of results
+already has is not trained again.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import itertools
 import json
 import multiprocessing
@@ -288,8 +290,8 @@ def named(rows: Rows, fault: Fault) -> tuple[int, dict[str, int]]:
     return right, dict(causes.most_common())
 
 
-def table(rows: Rows) -> Iterator[str]:
-    """The page's tables, as Markdown: the totals, then everything that they are made of."""
+def table(rows: Rows, every: Path) -> Iterator[str]:
+    """The page's tables, as Markdown; what the totals are made of goes to the CSV `every`."""
     of, probes = defaultdict(list), {}
     for row in rows:
         if row["world"] == "check":
@@ -299,7 +301,9 @@ def table(rows: Rows) -> Iterator[str]:
     by_class = {each.change: probes[each.name] for each in (*SOUND, *CATALOGUE) if each.name in probes}
     totals: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     confusions: Counter[tuple[str, str]] = Counter()
-    lines = []
+    lines = [
+        ("fault", "agent", "half", "spoilt", "of", "first cause right", "named instead", "check", "rewards")
+    ]
     for fault in CATALOGUE:
         mine = of[fault.name]
         right, instead = named(mine, fault)
@@ -307,10 +311,11 @@ def table(rows: Rows) -> Iterator[str]:
         spoilt = sum(not row["certified"] for row in mine)
         failed = by_class.get(fault.change)
         is_killed = killed_by_rewards(mine, of[f"sound {fault.agent}"])
-        lines.append(
-            f"| {fault.title} | {half(fault)} | {spoilt} of {len(mine)} | {right} | {_listed(instead)} | "
-            f"{'-' if failed is None else len(failed) or '**passes**'} | {'killed' if is_killed else '-'} |"
-        )
+        instead_of_it = ", ".join(f"{cause} {count}" for cause, count in instead.items())
+        probes_failed = "" if failed is None else len(failed) or "passes"
+        title = fault.title.split(" | ")
+        counts = (half(fault), spoilt, len(mine), right, instead_of_it, probes_failed)
+        lines.append((*title, *counts, "killed" if is_killed else ""))
         for key in ((fault.source, half(fault)), ("all", half(fault)), ("all", "both")):
             totals[key].update(
                 faults=1, runs=len(mine), spoilt=spoilt, right=right, classes=failed is not None,
@@ -325,9 +330,8 @@ def table(rows: Rows) -> Iterator[str]:
             f"| {source} | {part} | {n['faults']} | {n['some']} | {n['runs']} | {n['spoilt']} | {share} | "
             f"{n['check']} of {n['classes']} | {n['rewards']} of {n['faults']} |"
         )
-    yield "\n| fault | agent | half | spoilt | first cause right | named instead | `check` | rewards |"
-    yield "|---|---|---|--:|--:|---|--:|---|"
-    yield from lines
+    with every.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(lines)
     yield "\n| what was wrong | named instead | runs |\n|---|---|--:|"
     for (cause, other), count in confusions.most_common():
         yield f"| `{cause}` | `{other}` | {count} |"
@@ -361,6 +365,8 @@ def main() -> None:
         "--sound-seeds", type=int, default=20, help="of each shipped agent in each shipped world"
     )
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time; 0: print the tables only")
+    every = Path(__file__).parents[1] / "data" / "faults.csv"
+    parser.add_argument("--csv", type=Path, default=every, help="where every fault is written")
     words = parser.parse_args()
     words.results.touch()
     rows = [json.loads(line) for line in words.results.read_text().splitlines()]
@@ -376,7 +382,7 @@ def main() -> None:
                 file.write(json.dumps(row) + "\n")
                 file.flush()
                 print(f"{number}/{len(missing)} {row}", file=sys.stderr)
-    print(*table(rows), sep="\n")
+    print(*table(rows, words.csv), sep="\n")
 
 
 if __name__ == "__main__":
