@@ -9,7 +9,7 @@ import dataclasses
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from gridworld.base.console import plain
@@ -167,6 +167,7 @@ def all_tables(report: Report) -> Iterator[Table]:
     study = report.study
     yield results_table(report.tasks, report.reasons)
     yield answer_table(study, report.tasks)
+    yield steps_table(study, report.tasks)
     yield runs_table(study)
     yield unusable_table(report.unusable)
     if report.reasons:
@@ -263,9 +264,20 @@ def overall_table(overall: Overall) -> Table:
 
 def answer_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
     """Seeds certified at the end, agents down and tasks across."""
-    found = {(result.group.agent, task.task): result.certified for task in tasks for result in task.results}
-    rows = [[agent, *(found.get((agent, task)) for task in study.tasks)] for agent in study.agents]
-    return Table("certified", "Seeds certified optimal at the end", ["agent", *study.tasks], rows)
+    cells = {(result.group.agent, task.task): result.certified for task in tasks for result in task.results}
+    return _grid("certified", "Seeds certified optimal at the end", study, cells)
+
+
+def steps_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
+    """The median steps until certified for good, agents down and tasks across."""
+    found = [(task.task, result) for task in tasks for result in task.results]
+    cells = {(result.group.agent, task): estimate(result, "steps", "median") for task, result in found}
+    return _grid("steps", "Steps until certified for good, median", study, cells)
+
+
+def _grid(name: str, caption: str, study: Study, cells: Mapping[tuple[str, str], Cell]) -> Table:
+    rows = [[agent, *(cells.get((agent, task)) for task in study.tasks)] for agent in study.agents]
+    return Table(name, caption, ["agent", *study.tasks], rows)
 
 
 def runs_table(study: Study) -> Table:
