@@ -301,9 +301,8 @@ def table(rows: Rows, every: Path) -> Iterator[str]:
     by_class = {each.change: probes[each.name] for each in (*SOUND, *CATALOGUE) if each.name in probes}
     totals: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     confusions: Counter[tuple[str, str]] = Counter()
-    lines = [
-        ("fault", "agent", "half", "spoilt", "of", "first cause right", "named instead", "check", "rewards")
-    ]
+    columns = ("fault", "agent", "half", "spoilt", "of", "right", "named instead", "check", "rewards")
+    lines: list[tuple[object, ...]] = [columns]
     for fault in CATALOGUE:
         mine = of[fault.name]
         right, instead = named(mine, fault)
