@@ -271,7 +271,11 @@ def answer_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
 def steps_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
     """The median steps until certified for good, agents down and tasks across."""
     found = [(task.task, result) for task in tasks for result in task.results]
-    cells = {(result.group.agent, task): estimate(result, "steps", "median") for task, result in found}
+    medians = [result.estimates.get(("steps", "median")) for _, result in found]
+    cells = {
+        (result.group.agent, task): None if median is None else median.point
+        for (task, result), median in zip(found, medians, strict=True)
+    }
     return _grid("steps", "Steps until certified for good, median", study, cells)
 
 

@@ -255,7 +255,11 @@ def test_an_endless_walk_that_costs_infinitely_much_is_shown(tmp_path: Path) -> 
     assert estimates["regret", "iqm"].point == estimates["regret", "median"].point == math.inf
     assert estimates["value", "mean"].point == -math.inf
     assert task.results[0].regret.point[0] == math.inf
-    assert ",inf," in (report_of(tmp_path) / "tables" / "results.csv").read_text()
+    tables = report_of(tmp_path) / "tables"
+    assert ",inf," in (tables / "results.csv").read_text()
+    assert (tables / "steps.csv").read_text().splitlines()[1:] == ["ppo,inf"]
+    maker.write(tmp_path / "4", 4, 2000)  # three of five: the median is the last of them
+    assert (report_of(tmp_path) / "tables" / "steps.csv").read_text().splitlines()[1:] == ["ppo,5000"]
 
 
 @pytest.mark.slow
