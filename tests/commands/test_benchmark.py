@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import itertools
 import json
 import sys
 from importlib import import_module
@@ -102,3 +103,21 @@ def test_the_page_of_faults_has_every_fault_and_adds_up(monkeypatch: pytest.Monk
     assert len({fault.operator for fault in faults.CATALOGUE if fault.source == "muPRL"}) == 8
     programs = {fault.operator for fault in faults.CATALOGUE if fault.source == "DRLinter"}
     assert len(programs) + len(faults.NOT_EXPRESSED) == 21
+
+
+def test_the_page_of_results_has_the_medians_of_its_csv() -> None:
+    page = (ROOT / "docs" / "reference" / "results.md").read_text("utf-8")
+    lines = [[cell.strip(" `") for cell in line.split("|")[1:-1]] for line in page.splitlines()]
+    start = next(at for at, cells in enumerate(lines) if cells[:1] == ["world"])
+    _, *agents = lines[start]
+    table = {world: cells for world, *cells in itertools.takewhile(len, lines[start + 2 :])}
+    shown = {(world, agent): cells[at] for world, cells in table.items() for at, agent in enumerate(agents)}
+    with (ROOT / "docs" / "data" / "results.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    expected = {}
+    for row in (row for row in rows if row["agent"] in agents):
+        count, total = row["seeds certified"], row["seeds certified of"]
+        text = f"{float(row['steps until certified for good, median']):,.0f}"
+        world = row["task"].replace(" (kwargs.is_slippery=false)", ", not slippery")
+        expected[world, row["agent"]] = text if count == total else f"{text} ({count} of {total})"
+    assert {key: cell for key, cell in shown.items() if cell} == expected

@@ -15,6 +15,7 @@ import random
 import sys
 from pathlib import Path
 
+import pages
 import plan
 import rows
 
@@ -25,8 +26,7 @@ def main(words: list[str]) -> None:
     """Do what the command line says."""
     parser = argparse.ArgumentParser("atlas", usage=__doc__)
     option = parser.add_argument
-    pages = ("implementations", "defaults")
-    option("what", choices=("install", *pages, "draw", "check", "repeat"))
+    option("what", choices=("install", "implementations", "defaults", "draw", "check", "repeat"))
     ours = [name for name, library in plan.LIBRARIES.items() if not library.pins]
     option("libraries", nargs="*", help=f"of {', '.join(plan.LIBRARIES)}; default: {', '.join(ours)}")
     option("--algorithms", nargs="+", default=list(plan.MATCHED), choices=plan.MATCHED)
@@ -43,9 +43,7 @@ def main(words: list[str]) -> None:
         for library in options.libraries:
             rows.install(library)
     elif options.what == "draw":
-        import pages as drawing
-
-        drawing.draw(rows.read(options.rows))
+        pages.draw(rows.read(options.rows))
     elif options.what == "check":
         for job in plan.jobs("implementations", libraries, options.algorithms, ["frozen_lake"], 1):
             check(job)

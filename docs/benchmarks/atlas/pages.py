@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from plan import CLEANRL, LIBRARIES, MARGIN, MATCHED, ROOT, Job, World, worlds_of
+from plan import CLEANRL, DISCOUNT, LIBRARIES, MARGIN, MATCHED, ROOT, Job, World, evaluator, worlds_of
 from rows import Row
 from scipy import stats
 
@@ -157,13 +157,13 @@ def _implementations(found: list[Group], figures: Path) -> dict[str, str]:
     named = ("algorithm", "world", "library")
     tested = ("same curve", "P(first is faster)", "ratio of steps, 90 %", f"p, margin {MARGIN}")
     drawn = [_curves(name, found, figures) for name in MATCHED if any(g.algorithm == name for g in found)]
+    lists = {**MATCHED, "names in CleanRL": {name: f"`{own}`" for name, own in CLEANRL.items()}}
     settings = [
-        (algorithm, f"`{name}`", str(value), f"`{CLEANRL[name]}`" if name in CLEANRL else "")
-        for algorithm, matched in MATCHED.items()
-        for name, value in matched.items()
+        f"- {what}: {', '.join(f'`{name}` {value}' for name, value in each.items())}"
+        for what, each in lists.items()
     ]
     return {
-        "settings": _table(("algorithm", "setting", "value", "CleanRL's name for it"), settings, 2),
+        "settings": "\n".join(settings),
         "results": _table((*named, *_SHOWN), lines),
         "pairs": _table((*named[:2], "pair", "verdict", *tested), pairs, 4),
         "figures": "\n\n".join(drawn),
@@ -203,7 +203,7 @@ def _defaults(found: list[Group], figures: Path) -> dict[str, str]:
     for kind, own in sorted(kinds.items()):
         each = [row for group in own for row in group.rows]
         share = statistics.share(sum(bool(row.certified_since) for row in each), len(each))
-        scales = [abs(group.world.evaluator.optimal_value) for group in own]
+        scales = [abs(evaluator(group.world, DISCOUNT).optimal_value) for group in own]
         shares = [np.minimum([row.regret / s for row in g.rows], 1) for g, s in zip(own, scales, strict=True)]
         regret = statistics.interval(statistics.mean, shares, SEED)
         causes = Counter(row.cause for row in each if row.cause).most_common()
@@ -214,7 +214,7 @@ def _defaults(found: list[Group], figures: Path) -> dict[str, str]:
     places = [
         (
             *(world.name, "yes" if world.mdp.is_stochastic else "no", str(world.mdp.num_states)),
-            f"{world.evaluator.optimum.expected_length:.1f}",
+            f"{evaluator(world, DISCOUNT).optimum.expected_length:.1f}",
             *(by_kind.get(kind, "") for kind in sorted(kinds)),
         )
         for world, by_kind in worlds.items()

@@ -22,11 +22,9 @@ from gridworld.world.mdp import Mdp
 
 ROOT = Path(__file__).parents[3]
 ROOM = Path(os.environ.get("ATLAS_ROOM", ROOT / "runs" / "atlas"))  # virtual environments and maps
+DISCOUNT = 0.99  # by which published defaults are scored; matched runs, by the one that they train with
 KEY = 7  # fields by which a row is known: `Job.key`
-GAMMA = 0.99
-# Implementations are called equal where the ratio of their geometric mean steps is within 4/5 to 5/4: the
-# bounds by which generic medicines are judged (FDA, 2001). It was set before any row was run.
-MARGIN = 1.25
+MARGIN = 1.25  # of a ratio of steps, as for generic medicines (FDA, 2001); set before any row was run
 
 
 @dataclass(frozen=True)
@@ -42,10 +40,6 @@ class World:
         return named_world(self.env, **dict(self.settings))
 
     @cached_property
-    def evaluator(self) -> Evaluator:
-        return Evaluator(self.mdp, GAMMA, self.mdp.max_episode_steps)
-
-    @cached_property
     def tables(self) -> str:
         """What a worker makes its environment of, as JSON."""
         names = ("next_state", "probability", "reward", "terminal", "start")
@@ -53,6 +47,12 @@ class World:
         arrays["observation"] = make_observation(self.mdp, "one_hot").table()
         limit = {"limit": self.mdp.max_episode_steps}
         return json.dumps(limit | {name: array.tolist() for name, array in arrays.items()})
+
+
+@cache
+def evaluator(world: World, gamma: float) -> Evaluator:
+    """Scores policies of a world."""
+    return Evaluator(world.mdp, gamma, world.mdp.max_episode_steps)
 
 
 def _world(name: str, env: str | None = None, **settings: Any) -> World:
@@ -63,7 +63,7 @@ _SIX = (
     *map(_world, ("classic", "cliff", "river_swim")),
     _world("frozen_lake", "frozen_lake_v1"),
     _world("deep_sea_6", "deep_sea", size=6),
-    _world("cliff_20", "cliff", max_episode_steps=20),  # a penalty for every step, and few of them
+    _world("cliff_40", "cliff", max_episode_steps=40),  # a penalty for every step, and few of them
 )
 _MORE = "aima_4x3 cliff_walking combination_lock deep_sea four_rooms frozen_lake_4x4 frozen_lake_8x8 maze"
 
@@ -80,7 +80,7 @@ def _random_maps() -> Iterator[World]:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text("\n".join(map("".join, cells)) + "\n")
             dry = _world(f"map_{size}_{number}", "classic", layout=str(path))
-            if dry.evaluator.optimal_value > 0:  # the goal can be reached
+            if evaluator(dry, DISCOUNT).optimal_value > 0:  # the goal can be reached
                 yield from (dry, _world(f"{dry.name}_slip", "classic", layout=str(path), slip=0.1))
                 number += 1
 
@@ -112,25 +112,20 @@ LIBRARIES = {
 }
 
 # Steps, and N, of which the number of environments is a divisor.
-LENGTHS = {"dqn": (30_000, 1000), "ppo": (51_200, 1000), "a2c": (50_000, 1000), "q_learning": (10_000, 250)}
+LENGTHS = {"dqn": (50_000, 1000), "ppo": (204_800, 4096), "a2c": (204_800, 4096), "q_learning": (20_000, 250)}
 DEFAULTS = (100_000, 5000)
-_EPSILON = {"exploration_initial_eps": 1.0, "exploration_final_eps": 0.05}
-_ON_POLICY = {"gamma": GAMMA, "ent_coef": 0.01, "vf_coef": 0.5, "max_grad_norm": 0.5, "n_envs": 4}
+_EPSILON = {"exploration_initial_eps": 1.0, "exploration_final_eps": 0.05, "exploration_fraction": 1.0}
+_SHARED: dict[str, Any] = {"n_envs": 32, "net_arch": [64, 64], "vf_coef": 0.5, "max_grad_norm": 0.5}
+_ON_POLICY = {"learning_rate": 5e-3, "gamma": 0.95, "gae_lambda": 0.95, "ent_coef": 0.2, **_SHARED}
 # fmt: off
 MATCHED: dict[str, dict[str, Any]] = {  # by Stable-Baselines3's names
     "dqn": {
-        "learning_rate": 1e-3, "buffer_size": 10_000, "batch_size": 64, "gamma": GAMMA, "tau": 1.0,
-        "learning_starts": 1000, "train_freq": 4, "target_update_interval": 500, **_EPSILON,
-        "exploration_fraction": 0.5, "net_arch": [120, 84],
+        "learning_rate": 5e-4, "batch_size": 128, "learning_starts": 1000, "target_update_interval": 500,
+        "buffer_size": 50_000, "train_freq": 4, "gamma": 0.9, "tau": 1.0, "net_arch": [120, 84], **_EPSILON,
     },
-    "ppo": {
-        "learning_rate": 1e-3, "n_steps": 128, "batch_size": 128, "n_epochs": 4, "gae_lambda": 0.95,
-        "clip_range": 0.2, **_ON_POLICY, "net_arch": [64, 64],
-    },
-    "a2c": {"learning_rate": 7e-4, "n_steps": 5, "gae_lambda": 1.0, **_ON_POLICY, "net_arch": [64, 64]},
-    "q_learning": {
-        "learning_rate": 0.1, "gamma": GAMMA, "initial_value": 0.0, **_EPSILON, "exploration_fraction": 1.0,
-    },
+    "ppo": {"n_steps": 128, "batch_size": 1024, "n_epochs": 4, "clip_range": 0.2, **_ON_POLICY},
+    "a2c": {"n_steps": 8, **_ON_POLICY},
+    "q_learning": {"learning_rate": 0.1, "gamma": 0.9, "initial_value": 0.0, **_EPSILON},
 }
 CLEANRL = {
     "train_freq": "train_frequency", "target_update_interval": "target_network_frequency",
@@ -188,11 +183,16 @@ class Job:
         settings = {} if is_default else settings_of(self.library, self.algorithm)
         found = {"library": self.library, "algorithm": self.algorithm, "steps": steps, "every": every}
         if self.library == "engine":
-            return found | {"words": _words(self.algorithm, settings, self.world)}
+            scored = f"evaluation.gamma={self.gamma}"
+            return found | {"words": [*_words(self.algorithm, settings, self.world), scored]}
         if is_default and self.library == "sb3":  # in its own loop, through this package, for `diagnose`
             words = ["agent.engine=stock", *_words(self.algorithm, settings, self.world)]
             return found | {"library": "engine", "words": words, "diagnose": True}
         return found | {"settings": settings, "commit": LIBRARIES[self.library].source[1]}
+
+    @property
+    def gamma(self) -> float:
+        return DISCOUNT if self.page == "defaults" else MATCHED[self.algorithm]["gamma"]
 
     @cached_property
     def digest(self) -> str:
@@ -224,7 +224,7 @@ def versions(library: str) -> str:
     for each in importlib.metadata.distributions(path=places if pins else sys.path):
         found.setdefault(each.metadata["Name"].replace("-", "_").lower(), each.version)
     commit = [f"commit {source[1][:8]}"] if source[1] else []
-    return ", ".join([*(f"{name} {found[name]}" for name in named.split()), *commit])
+    return ", ".join([*(f"{name} {found.get(name, 'missing')}" for name in named.split()), *commit])
 
 
 def jobs(page: str, libraries: list[str], algorithms: list[str], worlds: list[str], seeds: int) -> list[Job]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from plan import LIBRARIES, ROOM, ROOT, Job, python_of
+from plan import LIBRARIES, ROOM, ROOT, Job, evaluator, python_of
 
 from gridworld.base.errors import InputError
 from gridworld.world.chain import one_hot_policy
@@ -83,7 +83,7 @@ def work(job: Job, **more: Any) -> list[dict[str, Any]]:
         if actions := tuple(line.pop("actions", ())):
             if actions not in known:
                 policy = one_hot_policy(np.array(actions), job.world.mdp.num_actions)
-                known[actions] = job.world.evaluator.score(policy)
+                known[actions] = evaluator(job.world, job.gamma).score(policy)
             score = line["score"] = known[actions]
             line |= {"regret": score.regret, "certified": score.certified}
     return lines
