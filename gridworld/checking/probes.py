@@ -249,11 +249,7 @@ def first_backup(trained: Trained) -> str:
 
 
 def _near(
-    mdp: Mdp,
-    found: FloatArray,
-    exact: FloatArray,
-    states: BoolArray | None = None,
-    probability: bool = False,
+    mdp: Mdp, found: FloatArray, exact: FloatArray, states: BoolArray | None = None, probability: bool = False
 ) -> str:
     """Compare numbers of live states, or of these (S,) of them; says which is farthest from the exact one."""
     where = mdp.reachable & ~mdp.terminal & (True if states is None else states)

@@ -18,13 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gridworld.base.console import (
-    as_called,
-    command_line,
-    printable,
-    program,
-    tell_error,
-)
+from gridworld.base.console import as_called, command_line, printable, program, tell_error
 from gridworld.base.errors import InputError, install_command
 from gridworld.commands import parser_of
 from gridworld.commands.manual import choices

@@ -39,11 +39,7 @@ def algorithm_of(model_class: type[BaseAlgorithm]) -> type[Population] | None:
 
 
 def make_run(
-    model: BaseAlgorithm,
-    observation: ObservationTable,
-    envs: TrainingVectorEnv,
-    seed: int,
-    **options: Any,
+    model: BaseAlgorithm, observation: ObservationTable, envs: TrainingVectorEnv, seed: int, **options: Any
 ) -> Run:
     """A run of a model that SB3 has just made, so that its generators are where `learn` would find them.
 

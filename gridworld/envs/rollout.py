@@ -36,10 +36,7 @@ def _estimate_share(hits: BoolArray) -> Estimate:
 
 
 def _estimate_mean(
-    samples: FloatArray,
-    unseen: float,
-    unseen_if_equal: float,
-    bounds: tuple[float, float],
+    samples: FloatArray, unseen: float, unseen_if_equal: float, bounds: tuple[float, float]
 ) -> Estimate:
     """The mean of samples (n,), with a normal interval that is widened by what rare samples may hide.
 

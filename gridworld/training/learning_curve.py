@@ -92,11 +92,7 @@ class LearningCurve:
     """
 
     def __init__(
-        self,
-        evaluator: Evaluator,
-        agent: Agent,
-        config: TrainConfig,
-        envs: TrainingVectorEnv | None = None,
+        self, evaluator: Evaluator, agent: Agent, config: TrainConfig, envs: TrainingVectorEnv | None = None
     ) -> None:
         self.evaluator = evaluator
         self.certificate = Certificate()

@@ -15,16 +15,7 @@ from numpy.typing import NDArray
 
 from gridworld.envs import rendering as drawing
 from gridworld.envs.rendering import AGENT, GOAL, UNKNOWN, Colour, Frame, Kind, Point, board_of
-from gridworld.visualization.sheet import (
-    PAPER,
-    UNREACHABLE,
-    WORDS,
-    ColourArray,
-    Scale,
-    Sheet,
-    Swatch,
-    disc,
-)
+from gridworld.visualization.sheet import PAPER, UNREACHABLE, WORDS, ColourArray, Scale, Sheet, Swatch, disc
 from gridworld.world.grid import GridMdp
 from gridworld.world.layout import MOVES
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp

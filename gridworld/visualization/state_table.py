@@ -12,16 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.envs import rendering as drawing
-from gridworld.envs.rendering import (
-    INK,
-    SMALLEST_TEXT,
-    UNKNOWN,
-    Colour,
-    Frame,
-    Point,
-    text_size,
-    text_width,
-)
+from gridworld.envs.rendering import INK, SMALLEST_TEXT, UNKNOWN, Colour, Frame, Point, text_size, text_width
 from gridworld.visualization.sheet import PAPER, Scale, Sheet, Swatch, short, write
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 

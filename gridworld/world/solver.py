@@ -30,14 +30,7 @@ import numpy as np
 
 from gridworld.base.errors import InputError
 from gridworld.world import levels
-from gridworld.world.chain import (
-    DENSE_STATES,
-    ORDINARY_GAMMA,
-    Chain,
-    Evaluation,
-    check_gamma,
-    one_hot_policy,
-)
+from gridworld.world.chain import DENSE_STATES, ORDINARY_GAMMA, Chain, Evaluation, check_gamma, one_hot_policy
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup, steps_to
 
 # Two actions whose values agree to this relative precision are equally good. Rounding stays far below it.

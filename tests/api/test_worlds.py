@@ -147,14 +147,8 @@ def test_a_run_is_scored_on_its_own_world() -> None:
         (lambda: gridworld.evaluate([1], "Nowhere-v1"), "env.id=Nowhere-v1: "),
         (lambda: gridworld.evaluate([1], "arrays"), "env.path: has no value"),
         (lambda: gridworld.compile_env("nowhere"), "env=nowhere: .* choose from aima_4x3, "),
-        (
-            lambda: gridworld.compile_env(gym.make("CartPole-v1")),
-            "its states are continuous",
-        ),
-        (
-            lambda: gridworld.compile_env(make_vec_env("CartPole-v1", 1)),
-            "its states are continuous",
-        ),
+        (lambda: gridworld.compile_env(gym.make("CartPole-v1")), "its states are continuous"),
+        (lambda: gridworld.compile_env(make_vec_env("CartPole-v1", 1)), "its states are continuous"),
         (lambda: gridworld.compile_env(3), "env: int is not an environment"),
         (lambda: gridworld.compile_mdp("classic"), "layout='classic': must be a Layout; load"),  # type: ignore[arg-type]
         (lambda: gridworld.make_vec("FrozenLake"), "mdp=FrozenLake: must be a compiled world"),

@@ -62,10 +62,7 @@ def test_forms_of_a_policy(policy: Any) -> None:
         (None, r"must return a policy; policy: NoneType is neither"),
         ([[0, 1, 0.5], [0, 0, 0]], "rows are not probability distributions; give Q values as {.q.: ...}"),
         ([[0, 2, -1], [0, 2, -1]], "not probability distributions"),
-        (
-            [1, 0, 0],
-            r"has shape \(3,\); must be \(2,\) actions or \(2, 3\) probabilities",
-        ),
+        ([1, 0, 0], r"has shape \(3,\); must be \(2,\) actions or \(2, 3\) probabilities"),
         ([3, 0], "state 0 has the action 3; must be 0"),
         ({"q": [1, 0]}, r"q: has shape \(2,\); must be \(2, 3\)"),
         ({"q": [[0, 1, 0]] * 2, "values": [[0]]}, r"values: has shape \(1, 1\); must be \(2,\)"),

@@ -109,9 +109,7 @@ def test_settings_are_refused_before_anything_is_written(
 
 
 @pytest.mark.parametrize(
-    ("line", "words"),
-    [row for row in REFUSED if OF_THE_COMMAND.search(row[0])],
-    ids=lambda value: value[:60],
+    ("line", "words"), [row for row in REFUSED if OF_THE_COMMAND.search(row[0])], ids=lambda value: value[:60]
 )
 def test_train_refuses_before_it_writes(
     line: str,

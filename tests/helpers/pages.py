@@ -35,7 +35,7 @@ _SEEDS = re.compile(r"seed=(?:range\(\d+\)|[\d,]+,\d+)$")
 _FEW_STEPS = ["total_timesteps=1000", "evaluation.every=500"]
 NO_PICTURES = [f"recording.{name}=false" for name in PICTURES]
 _FEW_TRIALS = [
-    *("tune.trials=2", "tune.seeds=1", "tune.final_seeds=1", "tune.confirm_seeds=2", "tune.workers=1"),
+    *("tune.trials=2", "tune.seeds=1", "tune.final_seeds=1", "tune.confirm_seeds=2", "tune.workers=1")
 ]
 
 

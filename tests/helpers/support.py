@@ -139,9 +139,7 @@ def start(name: str, *words: str, cwd: Path, **environment: str) -> forks.Starte
 
 
 def wait_for(
-    condition: Callable[[], object],
-    what: str,
-    process: subprocess.Popen[bytes] | forks.Started | None = None,
+    condition: Callable[[], object], what: str, process: subprocess.Popen[bytes] | forks.Started | None = None
 ) -> None:
     """Until it holds, while the process is at work. Fails after three minutes."""
     end = time.monotonic() + 180

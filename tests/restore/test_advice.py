@@ -18,11 +18,7 @@ SHORT = ["total_timesteps=200", "evaluation.every=20", *NO_FILES]
     [
         (["env=cliff", "tuned=none"], "its recipe:", "train agent=q_learning env=cliff"),
         (["env.layout=four_rooms"], "its recipe:", "train agent=q_learning env=four_rooms"),
-        (
-            ["env.slip=0.1", "seed=3"],
-            "for stochastic worlds:",
-            "train agent=q_learning env.slip=0.1 seed=3",
-        ),
+        (["env.slip=0.1", "seed=3"], "for stochastic worlds:", "train agent=q_learning env.slip=0.1 seed=3"),
         (["env.num_rows=9"], "for large worlds:", "train agent=q_learning env.num_rows=9"),
     ],
 )

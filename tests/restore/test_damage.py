@@ -174,16 +174,8 @@ def test_a_format_that_is_not_the_seals_is_told(good: Path, tmp_path: Path) -> N
 JOB = {"job": "seed=0", "hash": "1" * 32, "overrides": ["seed=0"]}
 HOSTILE: list[tuple[str, dict[str, object] | None, str]] = [  # a file, what is changed in it, None: a pipe
     ("sweep.json", None, "error: .*is not an ordinary file"),
-    (
-        "sweep.json",
-        {"jobs": [JOB | {"overrides": [1]}]},
-        r"error: .* \(overrides must be a command line",
-    ),
-    (
-        "sweep.json",
-        {"jobs": [JOB, JOB | {"hash": "2"}]},
-        r"error: .* \(two jobs have the same folder",
-    ),
+    ("sweep.json", {"jobs": [JOB | {"overrides": [1]}]}, r"error: .* \(overrides must be a command line"),
+    ("sweep.json", {"jobs": [JOB, JOB | {"hash": "2"}]}, r"error: .* \(two jobs have the same folder"),
     ("jobs.csv", None, "3 jobs: 1 pending, 1 done, 1 failed"),
     ("seed=0/summary.json", None, "failed .*summary.json: is not an ordinary file"),
     ("seed=0/manifest.json", {"status": []}, "failed .*manifest.json: status must be a word"),

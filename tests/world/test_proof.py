@@ -36,11 +36,7 @@ def world(numbers: np.random.Generator, size: int, scale: float = 1.0) -> Mdp:
     following[ends] = np.flatnonzero(ends)[:, None, None]
     reward[ends] = 0
     tables = Outcomes(
-        next_state=following,
-        probability=probability,
-        reward=reward,
-        terminated=ends[following],
-        start=start,
+        next_state=following, probability=probability, reward=reward, terminated=ends[following], start=start
     )
     return mdp_from_outcomes("random", tables)
 

@@ -201,10 +201,7 @@ def test_a_gamma_is_a_number_from_0_to_1(gamma):
         Chain(mdp, UNIFORM).value(gamma)
 
 
-@pytest.mark.parametrize(
-    "row",
-    [[1, 0.5, -0.5, 0], [0.5, 0.5, 0.5, 0], 0, np.nan, [np.inf, 0, 0, 0]],
-)
+@pytest.mark.parametrize("row", [[1, 0.5, -0.5, 0], [0.5, 0.5, 0.5, 0], 0, np.nan, [np.inf, 0, 0, 0]])
 def test_what_is_no_policy_is_refused(row):
     mdp, broken = compile_mdp(load("classic")), UNIFORM.copy()
     broken[7] = row

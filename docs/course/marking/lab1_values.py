@@ -12,7 +12,7 @@ from gridworld.world.mdp import backup
 from gridworld.world.solver import solved
 
 PUBLIC = {  # a name, a map, a slip and a discount
-    "worlds": [["the sheet's world", "S.....\n....T.\n...TG.\n....T.\n......\n", 0.2, 0.95]],
+    "worlds": [["the sheet's world", "S.....\n....T.\n...TG.\n....T.\n......\n", 0.2, 0.95]]
 }
 TOLERANCE = 1e-6
 

@@ -14,7 +14,7 @@ from gridworld.world.mdp import backup
 from gridworld.world.solver import solved
 
 PUBLIC = {  # a name, a map, a slip and a reward of each step; `hidden/` has others
-    "worlds": [["the sheet's world", "S.....\n....T.\n...TG.\n....T.\n......\n", 0.0, 0.0]],
+    "worlds": [["the sheet's world", "S.....\n....T.\n...TG.\n....T.\n......\n", 0.0, 0.0]]
 }
 GAMMA = 0.9
 RUNS = {  # as in the sheet

@@ -37,20 +37,9 @@ from gymnasium.spaces import Dict
 from numpy.typing import NDArray
 
 from gridworld.base.errors import InputError, in_short
-from gridworld.base.user_input import (
-    check_memory,
-    named_object,
-    npz_arrays,
-    npz_bytes,
-    open_users_file,
-)
+from gridworld.base.user_input import check_memory, named_object, npz_arrays, npz_bytes, open_users_file
 from gridworld.world.mdp import Mdp, frozen, leaves_of
-from gridworld.world.outcomes import (
-    Outcomes,
-    checked_text,
-    mdp_from_outcomes,
-    verified,
-)
+from gridworld.world.outcomes import Outcomes, checked_text, mdp_from_outcomes, verified
 from gridworld.world.shown import space_of_text, space_text
 from gridworld.world.sources.cassandra import world_of_text
 from gridworld.world.sources.files import dense, mat_arrays, outcomes_of_matrices

@@ -397,11 +397,7 @@ def test_the_three_things_that_a_function_may_return():
         ("gridworld.world.nothing", None, "env.builder=gridworld.world.nothing: must be the import path"),
         ("gridworld.ENV_ID", None, "env.builder=gridworld.ENV_ID: must be the import path"),
         (3, None, "env.builder=3: must be"),
-        (
-            "os.getcwd",
-            None,
-            "env.builder=os.getcwd: returned str, must return an Mdp, Outcomes, a mapping",
-        ),
+        ("os.getcwd", None, "env.builder=os.getcwd: returned str, must return an Mdp, Outcomes, a mapping"),
         (raising, None, "env.builder=raising: raised RuntimeError: no power"),
         (raising, {"txt": 1}, "env.builder=raising: raised TypeError: .*unexpected keyword argument 'txt'"),
         (raising, {"text": "one\ntwo"}, "env.builder=raising: raised RuntimeError: one$"),

@@ -192,8 +192,7 @@ def test_custom_environments_are_their_tables(compiled: Any, kind: Any, rows: An
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("env_id", "kwargs"),
-    [("FrozenLake-v1", {}), ("FrozenLake-v1", {"desc": ["SFH", "FFG"]})],
+    ("env_id", "kwargs"), [("FrozenLake-v1", {}), ("FrozenLake-v1", {"desc": ["SFH", "FFG"]})]
 )
 def test_gymnasiums_environments_are_their_tables(env_id: str, kwargs: dict[str, Any]) -> None:
     ignore = ["P", "lastaction"]  # which the steps do not change, or not read
@@ -473,10 +472,7 @@ UNSOUND: dict[str, tuple[dict[str, Any], str]] = {
         },
         "makes another np_random",
     ),
-    "a class attribute that takes turns": (
-        {"move": _guess(lambda s: _in_turn(_Held))},
-        "draws otherwise",
-    ),
+    "a class attribute that takes turns": ({"move": _guess(lambda s: _in_turn(_Held))}, "draws otherwise"),
     "an iterator outside": ({"move": _guess(lambda s: next(_turns))}, "draws otherwise"),
     "what cannot be read outside": ({"move": _guess(lambda s: _in_turn(_thread))}, "draws otherwise"),
     "a rare end that no reset clears": (
@@ -537,10 +533,7 @@ SOUND: dict[str, tuple[dict[str, Any], float]] = {  # and what a step pays in th
         {"move": lambda s, a: (0, float(isinstance(s.np_random, np.random.Generator)), False)},
         1.0,
     ),
-    "a sample of the actions": (
-        {"move": lambda s, a: (0, float(s.action_space.sample()), False)},
-        0.5,
-    ),
+    "a sample of the actions": ({"move": lambda s, a: (0, float(s.action_space.sample()), False)}, 0.5),
     "a draw that is kept, and not used": (
         {"move": lambda s, a: (s.__dict__.update(last=s.np_random.random()) or 0, 1.0, False)},
         1.0,
@@ -551,7 +544,7 @@ SOUND: dict[str, tuple[dict[str, Any], float]] = {  # and what a step pays in th
                 setattr(s, "luck", int(s.np_random.integers(2))) or 0,
                 float(s.np_random.integers(2)),
                 False,
-            ),
+            )
         },
         0.5,
     ),
