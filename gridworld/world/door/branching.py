@@ -12,7 +12,6 @@ from __future__ import annotations
 import itertools
 import math
 import sys
-import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -62,7 +61,8 @@ class Branching:
         self._taken: list[int] = []  # the place of each decision's outcome among those possible
         self._place = 0  # of the next decision
         self._refused: InputError | None = None  # kept, since an environment may catch it
-        self.until = math.inf  # the moment, of the monotonic clock, at which its time is over
+        # Refuses to go on, after so many outcomes of a step, where the time is over.
+        self.check_time: Callable[[int], None] = lambda _: None
         self.run = 0  # counts the runs, so that what is left of another one is recognised
         self._is_running = False
         self._num_results = 0
@@ -95,14 +95,6 @@ class Branching:
                 return
             self._taken[-1] += 1
         raise InputError(f"{self._where}: one step has more than {MOST_BRANCHES:,} random outcomes")
-
-    def check_time(self, number: int) -> None:
-        """Refuse to go on after so many outcomes where the time is over."""
-        if time.monotonic() > self.until:
-            raise InputError(
-                f"{self._where}: a reset or a step has more random outcomes than can be tried in the "
-                f"time allowed: after {number:,} there are more"
-            )
 
     def _ran(self, step: Callable[[], Result]) -> Result:
         """The result of a step with the decisions that are taken, and first outcomes after them."""
@@ -169,7 +161,9 @@ class Branching:
     def line() -> str:
         """The file and line that called into this module, or compared one of its numbers."""
         frame = sys._getframe(1)
-        while frame.f_back is not None and frame.f_code.co_filename in OURS:
+        while frame.f_back is not None and (
+            frame.f_code.co_filename in OURS or frame.f_globals["__name__"].startswith("gymnasium.spaces")
+        ):
             frame = frame.f_back
         return f"{frame.f_code.co_filename}:{frame.f_lineno}"
 

@@ -24,6 +24,7 @@ class Budget:
 
     def __init__(self, search: Search, most_states: int, most_seconds: float) -> None:
         self._search, self.most_states, self._most_seconds = search, most_states, most_seconds
+        self._is_by_settings = search.where.startswith("env.id")
         self._began = time.monotonic()
         self._line, self._due = ProgressLine(enabled=True, seconds_between_lines=_BETWEEN_LINES), _FIRST
         self._growing = ""
@@ -52,12 +53,19 @@ class Budget:
             raise search.refusal(f"copies of the first {len(search.states):,} states take more than {most}")
         check_memory(search.where, num_bytes)
 
-    def check_seconds(self) -> None:
-        """Refuse to go on where its time is over."""
+    def check_seconds(self, outcomes: int = 0) -> None:
+        """Refuse to go on where its time is over, in a step that has had so many outcomes."""
         if self.seconds_left() < 0:
-            found = f"it still finds new states ({len(self._search.states):,} so far)"
-            raise self._search.refusal(
-                f"after {self._most_seconds:.0f} s {found}, since its {self.what_changes()}"
+            size, search = len(self._search.states), self._search
+            if outcomes >= size:  # so that is what took long
+                raise search.refusal(
+                    "a reset or a step has more random outcomes than can be tried in the time allowed: "
+                    f"after {outcomes:,} there are more"
+                )
+            more = f"{'env.' * self._is_by_settings}most_seconds={2 * self._most_seconds:g}"
+            raise search.refusal(
+                f"after {self._most_seconds:g} s it still finds new states ({size:,} so far; {more} allows "
+                f"more), since its {self.what_changes()}"
             )
 
     def show(self, what: str) -> None:
@@ -75,22 +83,26 @@ class Budget:
         self._line.clear()
 
     def _most_values(self) -> str:
-        """The attributes with the most values, the elapsed time among them."""
-        values: dict[str, set[Any]] = {}
+        """The attributes with the most values that only later states have, the elapsed time among them."""
+        values: dict[str, dict[Any, int]] = {}  # with the number of the state in which each is met first
         layers, ignore = self._search.layers, self._search.ignore
-        for state in [each for each in self._search.states[::SAMPLED] if each.copy][-_MOST_SAMPLES:]:
+        found = [each for each in self._search.states[::SAMPLED] if each.copy][-_MOST_SAMPLES:]
+        for number, state in enumerate(found):
             layers.put(state.copy, state.depth)
             for (_, name), key in layers.values(ignore).items():
-                values.setdefault(name, set()).add(key)
+                values.setdefault(name, {}).setdefault(key, number)
             for clock in layers.clocks:
-                values.setdefault(clock.key[1], set()).add(state.depth)
-        most = max(map(len, values.values()), default=0)
-        return ", ".join(sorted(name for name, found in values.items() if len(found) == most)) or "state"
+                values.setdefault(clock.key[1], {}).setdefault(state.depth, number)
+        late = {
+            name: (sum(2 * number >= len(found) for number in each.values()), len(each))
+            for name, each in values.items()
+        }
+        return ", ".join(sorted(name for name in late if late[name] == max(late.values()))) or "state"
 
     def what_changes(self) -> str:
         """What keeps changing, and a remedy, as the rest of a sentence."""
         names = self._most_values()
-        first, by_settings = names.split(",")[0], self._search.where.startswith("env.id")
+        first, by_settings = names.split(",")[0], self._is_by_settings
         limit = "env.kwargs.max_episode_steps" if by_settings else "gymnasium.wrappers.TimeLimit"
         ignored = f"env.ignore=[{first}]" if by_settings else f'ignore=["{first}"]'
         return (

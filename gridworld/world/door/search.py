@@ -12,7 +12,6 @@ import hashlib
 import itertools
 import math
 import pickle
-import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -127,7 +126,7 @@ class Search:
     def _explored(self, **how: bool) -> None:
         runs = (Search.reset_from.__code__, Search.stepped_from.__code__)
         self.branching = Rejecting(self.where, self._everything, runs, self._read is not None, self._compares)
-        self.branching.until = time.monotonic() + self.budget.seconds_left()
+        self.branching.check_time = self.budget.check_seconds
         self.layers = layers = Layers(self.where, self.env, self.branching, **how)
         with layers.restored():
             self.begin, before = layers.take(), layers.values()

@@ -1,8 +1,12 @@
 """Environments as people have them become exact worlds: wrappers, memory, Dicts, clocks, batches, classes."""
 
 import enum
+import itertools
+import linecache
 import math
+import re
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -1023,6 +1027,64 @@ class Scattered(Retries):
 def test_a_reset_with_too_many_outcomes_is_refused_within_its_time(env):
     with pytest.raises(InputError, match="more random outcomes than can be tried in the time allowed: after"):
         gridworld.compile_env(env, most_seconds=0.5)
+
+
+class Wanders(gym.Env):
+    """Every step goes on by one or two, at one of fifty places: few outcomes, and no end of states."""
+
+    observation_space, action_space = gym.spaces.Box(0, 2**40, (2,), np.int64), gym.spaces.Discrete(30)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = [int(self.np_random.integers(50)), 0]
+        return np.array(self.place), {}
+
+    def step(self, action):
+        self.place[1] = self.place[1] * 30 + int(action) + int(self.np_random.integers(2))
+        return np.array(self.place), 0.0, False, False, {}
+
+
+def test_a_search_whose_time_is_over_says_how_to_give_it_more(monkeypatch):
+    looks = itertools.count()
+    monkeypatch.setattr(time, "monotonic", lambda: next(looks) / 1000)  # however busy the machine is
+    with pytest.raises(InputError, match=r"after 1 s it .* new states .*; most_seconds=2 allows more\)"):
+        gridworld.compile_env(Wanders, most_seconds=1)
+
+
+class Hurries(gym.Env):
+    """Two places on a ring of ten are drawn; to bring one to the other pays less, the later it is."""
+
+    observation_space, action_space = gym.spaces.MultiDiscrete([10, 10]), gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.goal = self.np_random.choice(10, 2, replace=False).tolist()
+        self.count = 0
+        return (self.place, self.goal), {}
+
+    def step(self, action):
+        self.place, self.count = (self.place + 2 * int(action) - 1) % 10, self.count + 1
+        is_over = self.place == self.goal
+        return (self.place, self.goal), 10 - 0.1 * self.count if is_over else 0.0, is_over, False, {}
+
+
+def test_a_search_with_too_many_states_names_what_has_ever_more_values():
+    with pytest.raises(InputError, match=r"more than 800 states .* since its count keeps changing"):
+        gridworld.compile_env(Hurries, most_states=800)
+
+
+class Sampled(Wanders):
+    """A draw that cannot be enumerated, made by a space."""
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}  # the line that is to be found
+
+
+def test_a_draw_that_a_space_makes_is_found_where_the_environment_asks_for_it():
+    with pytest.raises(InputError) as error:
+        gridworld.compile_env(Sampled)
+    path, line = re.search(r"\((\S+):(\d+)\)", str(error.value)).groups()
+    assert "the line that is to be found" in linecache.getline(path, int(line))
 
 
 class Optional(gym.Env):
