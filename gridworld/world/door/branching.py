@@ -153,8 +153,7 @@ class Branching:
 
     def refuse(self, what: str, remedy: str = _UNLIKE, drawn: str | None = None) -> NoReturn:
         """Refuse a draw, with the line that made it or the one given."""
-        at = drawn or self.line()
-        self._refused = self._refused or InputError(f"{self._where}: {what} ({at}){remedy}")
+        self._refused = self._refused or InputError(f"{self._where}: {what} ({drawn or self.line()}){remedy}")
         raise self._refused
 
     @staticmethod
@@ -248,9 +247,7 @@ class Branching:
             pool = np.arange(int(pool))
         elif p is None and size is None and pool.ndim == 1 and pool.dtype.kind in "biufUS":
             values, weights = _distinct(pool.dtype.str, pool.tobytes())
-            if len(values) > MOST_OUTCOMES:
-                self.refuse(f"a choice has {len(values):,} outcomes, more than {MOST_OUTCOMES:,}")
-            number = self.decide(weights)
+            number = self._among(weights)
             if type(a) is list and self._place > place:
                 self._decisions[place].pool, self._decisions[place].values = list(a), values
             return values[number]

@@ -29,11 +29,7 @@ class Budget:
         self._line, self._due = ProgressLine(enabled=True, seconds_between_lines=_BETWEEN_LINES), _FIRST
         self._growing = ""
         self.is_explored = False  # then its environment is as it was, and not to be touched
-        self.begin()
-
-    def begin(self) -> None:
-        """Nothing is found yet, as where a search begins again."""
-        self.num_bytes, self.most_now = 0, self.most_states
+        self.num_bytes, self.most_now = 0, most_states
 
     def seconds_left(self) -> float:
         """Of those that it may take."""
@@ -73,8 +69,8 @@ class Budget:
         seconds = time.monotonic() - self._began
         if seconds >= self._due:
             self._due = seconds + _BETWEEN_LOOKS
-            if seconds > _SLOW and not (self._growing or self.is_explored):
-                self._growing = f"; {self._most_values()} keeps changing"
+            if seconds > _SLOW and not (self._growing or self.is_explored) and (names := self._most_values()):
+                self._growing = f"; {names} keeps changing"
             where = self._search.where
             self._line.show(lambda: f"{where}: {what}, {seconds:.0f} s{self._growing}; Ctrl-C ends it")
 
@@ -83,7 +79,7 @@ class Budget:
         self._line.clear()
 
     def _most_values(self) -> str:
-        """The attributes with the most values that only later states have, the elapsed time among them."""
+        """The attributes, or times, of most values that only later states have; empty: none has several."""
         values: dict[str, dict[Any, int]] = {}  # with the number of the state in which each is met first
         layers, ignore = self._search.layers, self._search.ignore
         found = [each for each in self._search.states[::SAMPLED] if each.copy][-_MOST_SAMPLES:]
@@ -96,12 +92,13 @@ class Budget:
         late = {
             name: (sum(2 * number >= len(found) for number in each.values()), len(each))
             for name, each in values.items()
+            if len(each) > 1
         }
-        return ", ".join(sorted(name for name in late if late[name] == max(late.values()))) or "state"
+        return ", ".join(sorted(name for name in late if late[name] == max(late.values())))
 
     def what_changes(self) -> str:
         """What keeps changing, and a remedy, as the rest of a sentence."""
-        names = self._most_values()
+        names = self._most_values() or "state"
         first, by_settings = names.split(",")[0], self._is_by_settings
         limit = "env.kwargs.max_episode_steps" if by_settings else "gymnasium.wrappers.TimeLimit"
         ignored = f"env.ignore=[{first}]" if by_settings else f'ignore=["{first}"]'
