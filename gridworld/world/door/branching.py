@@ -161,7 +161,8 @@ class Branching:
         """The file and line that called into this module, or compared one of its numbers."""
         frame = sys._getframe(1)
         while frame.f_back is not None and (
-            frame.f_code.co_filename in OURS or frame.f_globals["__name__"].startswith("gymnasium.spaces")
+            frame.f_code.co_filename in OURS
+            or frame.f_globals.get("__name__", "").startswith("gymnasium.spaces")
         ):
             frame = frame.f_back
         return f"{frame.f_code.co_filename}:{frame.f_lineno}"
