@@ -112,7 +112,7 @@ def cleanrl(job: dict[str, Any], reader: Reader) -> Saved:
     import torch
 
     source = Path(job["room"], "cleanrl", "source")
-    script = source / "cleanrl" / f"{job['algorithm']}.py"
+    script, change = source / "cleanrl" / f"{job['algorithm']}.py", job["settings"].pop("change", ("", ""))
     fixed = {"env_id": "Atlas-v0", "seed": job["seed"], "total_timesteps": job["steps"], "cuda": False}
     sys.argv = [script.name]
     for name, value in {**fixed, **job["settings"]}.items():
@@ -136,7 +136,7 @@ def cleanrl(job: dict[str, Any], reader: Reader) -> Saved:
 
     reader.greedy = greedy
     sys.path.insert(0, str(source))
-    exec(compile(script.read_text("utf-8"), str(script), "exec"), space)
+    exec(compile(script.read_text("utf-8").replace(*change), str(script), "exec"), space)
     return saved
 
 

@@ -99,6 +99,7 @@ class Library(NamedTuple):
     algorithms: str
     pins: str = ""
     source: tuple[str, str] = ("", "")  # a repository and the commit that is fetched next to it
+    more: Any = None  # settings that are added
 
 
 _OLD = "gymnasium==0.29.1 numpy==1.26.4 tyro==1.0.17 tensorboard==2.21.0 torch==2.13.0"
@@ -109,6 +110,12 @@ LIBRARIES = {
     "plain": Library("gymnasium numpy", "q_learning"),
     "sbx": Library("sbx_rl jax flax", "dqn ppo", "sbx-rl==0.28.0 jax==0.10.2 flax==0.12.8 torch==2.13.0"),
     "cleanrl": Library("torch gymnasium numpy", "dqn ppo", _OLD, _CLEANRL),
+}
+LIBRARIES |= {  # with one thing changed, to see what a difference comes from
+    "sb3+weights": LIBRARIES["sb3"]._replace(
+        algorithms="ppo", more={"policy_kwargs": {"net_arch": [64, 64], "ortho_init": False}}
+    ),
+    "cleanrl+l1": LIBRARIES["cleanrl"]._replace(algorithms="dqn", more={"change": ("F.mse", "F.smooth_l1")}),
 }
 
 # Steps, and N, of which the number of environments is a divisor.
@@ -137,21 +144,18 @@ CLEANRL = {
 
 def settings_of(library: str, algorithm: str) -> dict[str, Any]:
     """The matched settings by the library's own names."""
-    own = dict(MATCHED[algorithm])
+    own, base = dict(MATCHED[algorithm]), library.partition("+")[0]
     hidden = own.pop("net_arch", None)  # what the scripts of CleanRL have
-    if library == "cleanrl":
+    if base == "cleanrl":
         own = {CLEANRL.get(name, name): value for name, value in own.items()}
         if algorithm == "ppo":
             own["num_minibatches"] = own["num_envs"] * own["num_steps"] // own.pop("batch_size")
-            own |= {
-                "anneal_lr": False,
-                "clip_vloss": False,
-                "vf_coef": 2 * own["vf_coef"],
-            }  # of half a square
+            own["vf_coef"] *= 2  # of half a square
+            own |= {"anneal_lr": False, "clip_vloss": False}
     elif hidden is not None:
-        is_sbx_ppo = (library, algorithm) == ("sbx", "ppo")
+        is_sbx_ppo = (base, algorithm) == ("sbx", "ppo")
         own["policy_kwargs"] = {"net_arch": hidden, **({"ortho_init": True} if is_sbx_ppo else {})}
-    return own
+    return own | (LIBRARIES[library].more or {})
 
 
 def _words(algorithm: str, settings: dict[str, Any], world: World) -> list[str]:
@@ -181,7 +185,8 @@ class Job:
         is_default = self.page == "defaults"
         steps, every = DEFAULTS if is_default else LENGTHS[self.algorithm]
         settings = {} if is_default else settings_of(self.library, self.algorithm)
-        found = {"library": self.library, "algorithm": self.algorithm, "steps": steps, "every": every}
+        base = self.library.partition("+")[0]
+        found = {"library": base, "algorithm": self.algorithm, "steps": steps, "every": every}
         if self.library == "engine":
             scored = f"evaluation.gamma={self.gamma}"
             return found | {"words": [*_words(self.algorithm, settings, self.world), scored]}
@@ -209,7 +214,8 @@ class Job:
 
 def python_of(library: str) -> Path:
     """The Python that has a library."""
-    python = ROOM / library / "bin" / "python" if LIBRARIES[library].pins else Path(sys.executable)
+    room = ROOM / library.partition("+")[0]
+    python = room / "bin" / "python" if LIBRARIES[library].pins else Path(sys.executable)
     if not python.exists():
         raise InputError(f"{library}: is not installed; run python docs/benchmarks/atlas install {library}")
     return python
@@ -218,7 +224,7 @@ def python_of(library: str) -> Path:
 @cache
 def versions(library: str) -> str:
     """The versions of a library and of what decides its numbers."""
-    named, _, pins, source = LIBRARIES[library]
+    named, _, pins, source, _ = LIBRARIES[library]
     places = [str(path) for path in python_of(library).parents[1].glob("lib/python*/site-packages")]
     found = {"gridworld": gridworld.__version__}  # which runs in a checkout
     for each in importlib.metadata.distributions(path=places if pins else sys.path):
@@ -239,5 +245,5 @@ def jobs(page: str, libraries: list[str], algorithms: list[str], worlds: list[st
         for algorithm in algorithms
         for library in libraries
         if algorithm in LIBRARIES[library].algorithms.split()
-        if page == "implementations" or library not in ("engine", "plain")
+        if page == "implementations" or library in ("sb3", "sbx", "cleanrl")
     ]

@@ -139,7 +139,7 @@ def install(library: str) -> None:
 
     The environment variable ATLAS_SOURCE names another copy of that repository, a folder or an address.
     """
-    folder, (_, _, pins, (address, commit)) = ROOM / library, LIBRARIES[library]
+    folder, (_, _, pins, (address, commit), _) = ROOM / library, LIBRARIES[library]
     subprocess.run([sys.executable, "-m", "venv", folder], check=True)
     subprocess.run([folder / "bin" / "python", "-m", "pip", "install", "-q", *pins.split()], check=True)
     if address and not (folder / "source").exists():
