@@ -120,7 +120,7 @@ def _possible(mdp: Mdp, counted: FloatArray | BoolArray, gamma: float, limit: in
             best = (paid + gamma * before[mdp.next_state]).max(axis=(1, 2))
             if np.array_equal(best, before):
                 left = 0
-        ends.append(sign * float(best[mdp.start_states].max() + left * max(paid.max(), 0.0)))
+        ends.append(sign * float(best[mdp.start_states].max() + left * max(paid.max(), 0.0)) + 0.0)  # no -0
     return ends[0], ends[1]
 
 

@@ -27,7 +27,7 @@ from gridworld.world.mdp import BoolArray, IntArray
 from gridworld.world.shown import content
 
 _MOST_STATES, _SECONDS = 20_000, 10.0  # of a search
-_ALIASED = "its observations|observations stand for"  # in what is known of a world with beliefs
+_ALIASED = "its observations|observations stand for|beliefs about"  # in what is known of a world with beliefs
 _LOOKED_AT, _NAMED = 12, 3  # states that are compared by their attributes; attributes that are named
 _LEAST = 5  # conflicts, at least, that a cause must explain
 _TIME, _RESET, _BEFORE = "the step count", "what is drawn at reset", "the step before"

@@ -144,8 +144,8 @@ def generators_restored(env: Any) -> Iterator[None]:
 
 
 def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
-    """Take about so many steps, with one seed for everything."""
-    seed_all(env, seed)
+    """Take about so many steps, with one seed for everything; what a space draws differs from `actions`."""
+    seed_all(env, seed + 1)
     rows: list[tuple[Any, ...]] = []
     numbers: dict[bytes, int] = {}
     acts: dict[bytes, int] = {}

@@ -549,6 +549,42 @@ def test_a_hidden_goal_is_named_also_where_steps_draw(env: Any) -> None:
     assert "show goal" in result.findings[0].advice
 
 
+class HiddenSide(gym.Env[Any, Any]):
+    """Begins in the middle of a row with slippery cells, with the goal at an end: it shows its place only."""
+
+    observation_space, action_space = Discrete(7), Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Start:
+        super().reset(seed=seed)
+        self.place, self.goal = 3, 6 * int(self.np_random.integers(2))
+        return self.place, {}
+
+    def step(self, action: Any) -> Result:
+        forward = bool(action) != (self.np_random.random() < 0.2)
+        self.place += 1 if forward else -1
+        over = self.place in (0, 6)
+        return self.place, (1.0 if self.place == self.goal else -1.0) if over else 0.0, over, False, {}
+
+
+def test_a_hidden_goal_is_named_where_each_observation_stands_for_one_belief() -> None:
+    result = examine(HiddenSide, steps=STEPS)
+    assert "7 beliefs about 10 hidden states" in fact(result, "states")
+    assert "depend on what is drawn at reset (goal), which is not observed" in evidence(result, "markov")
+
+
+class StepsOnItsOwnSample(Walk):
+    """Moves where `action_space.sample()` says so."""
+
+    limit = STEPS
+
+    def step(self, action: Any) -> Result:
+        return super().step(action if self.action_space.sample() == 0 else 0)
+
+
+def test_what_a_space_draws_is_not_what_is_done() -> None:
+    assert examine(StepsOnItsOwnSample, steps=STEPS).topics == ["seed"]
+
+
 class Dirt(gym.Env[Any, Any]):
     """A vacuum cleaner in a row of cells, of which it does not see which are clean."""
 

@@ -230,6 +230,9 @@ def test_intervals_of_few_episodes_are_within_what_is_possible() -> None:
     assert few.episode_return.low == pytest.approx(0.232, abs=1e-3)
     assert few.discounted_return.high == pytest.approx(0.99**7)
     assert few.length.low == 5  # the nearest trap is one down and four to the right
+    never_loses = Evaluator(compile_mdp(parse("S.G", "small"), 0.0, 0.0), 0.9, 6)
+    one = sample_episodes(never_loses, never_loses.optimal_policy(), 1, seed=0)
+    assert f"{one.episode_return.low:.3g}" == "0"  # not -0
 
 
 @pytest.mark.slow
