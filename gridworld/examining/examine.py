@@ -252,20 +252,21 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
     if mdp is not None:
         with contextlib.suppress(InputError):  # there is no finite optimum
             best = Evaluator(mdp, seen.gamma, seen.limit or UNLIMITED).optimum
-            earned, length = f"{best.expected_return + 0.0:.4g}", f"{best.expected_length:.4g}"
+            earned, lasts = f"{best.expected_return + 0.0:.4g}", best.expected_length
+            length = f"{lasts:,.0f}" if lasts >= 1000 else f"{lasts:.4g}"
             found = f"returns {earned} in {length} step{'s' * (length != '1')}, and terminates in"
             yield "best policy", f"{found} {_episodes(1 - best.timeout)} (exact, for gamma={seen.gamma:g})"
 
 
 def _episodes(share: float) -> str:
-    some = f"{_percent(share, 3)} of its episodes"
-    return {0.0: "none of its episodes", 1.0: "every episode"}.get(share, some)
+    for bound, text in ((0.0, "none of its episodes"), (1.0, "every episode")):
+        if abs(share - bound) < 1e-12:  # a percentage would have more digits than anybody reads
+            return text if share == bound else f"practically {text}"
+    return f"{_percent(share, 3)} of its episodes"
 
 
 def _percent(share: float, decimals: int) -> str:
     """A probability with so many decimals, or with as many as distinguish it from 0 and from 1."""
-    for each in range(decimals, 13):
-        text = f"{share:.{each}%}"
-        if share in (0, 1) or float(text[:-1]) not in (0, 100):
-            return text
-    return "less than 1e-12" if share < 0.5 else "more than 99.9999999999%"
+    text = f"{share:.{decimals}%}"
+    is_distinct = share in (0, 1) or float(text[:-1]) not in (0, 100)
+    return text if is_distinct else _percent(share, decimals + 1)

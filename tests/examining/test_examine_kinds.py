@@ -724,7 +724,28 @@ class PaysWithNoise(PaysTotals):
         return self.earn(action) + float(self.np_random.integers(3))
 
 
-@pytest.mark.parametrize(("env", "found"), [(PaysTotals, 1), (PaysTotalsWithSlip, 1), (PaysWithNoise, 0)])
+class PaysByAHiddenGoal(gym.Env[Any, Any]):
+    """Walks on a line with noise, and pays by the distance to a goal that is not shown."""
+
+    observation_space, action_space = Box(-2.0, 2.0, (1,), np.float32), Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Start:
+        super().reset(seed=seed)
+        self.place, self.time, self.goal = 0.0, 0, float(self.np_random.choice([-1.0, 1.0]))
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Result:
+        self.time += 1
+        moved = self.place + 0.2 * float(action[0]) + 0.01 * self.np_random.normal()
+        self.place = min(max(moved, -2.0), 2.0)  # where it stays, it is paid as before
+        shown = np.array([self.place], np.float32)
+        return shown, -abs(self.place - self.goal), False, self.time >= 30, {}
+
+
+@pytest.mark.parametrize(
+    ("env", "found"),
+    [(PaysTotals, 1), (PaysTotalsWithSlip, 1), (PaysWithNoise, 0), (PaysByAHiddenGoal, 0)],
+)
 def test_rewards_that_are_totals_are_found(env: Any, found: int) -> None:
     result = examine(env, steps=STEPS)
     assert ("rewards are totals" in evidence(result, "reward")) == found, str(result)
@@ -759,12 +780,26 @@ class PunishesSuccess(Walk):
         return -float(self.over())
 
 
+class StaysForEver(PunishesSuccess):
+    def cut(self) -> bool:
+        return False
+
+
+class FailsRarely(Walk):
+    """A step fails once in twenty: within its limit it arrives with a probability of almost 1."""
+
+    def move(self, action: Any) -> None:
+        super().move(int(action) if self.np_random.integers(20) else 0)
+
+
 @pytest.mark.parametrize(
     ("env", "words"),
     [
         (Walk, "returns 1 in 5 steps, and terminates in every episode"),
         (PaysTheWay, "returns 2.1 in 40 steps, and terminates in none of its episodes"),  # 21 go right
         (PunishesSuccess, "returns 0 in 40 steps, and terminates in none of its episodes"),
+        (StaysForEver, "returns 0 in 10,000 steps, and terminates in none of its episodes"),
+        (FailsRarely, "returns 1 in 5.494 steps, and terminates in practically every episode"),
     ],
 )
 def test_what_the_best_policy_does_is_said(env: Any, words: str) -> None:
