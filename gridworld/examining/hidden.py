@@ -27,7 +27,6 @@ from gridworld.world.mdp import BoolArray, IntArray
 from gridworld.world.shown import content
 
 _MOST_STATES, _SECONDS = 20_000, 10.0  # of a search
-_ALIASED = "its observations|observations stand for|beliefs about"  # in what is known of a world with beliefs
 _LOOKED_AT, _NAMED = 12, 3  # states that are compared by their attributes; attributes that are named
 _LEAST = 5  # conflicts, at least, that a cause must explain
 _TIME, _RESET, _BEFORE = "the step count", "what is drawn at reset", "the step before"
@@ -44,10 +43,15 @@ _ADVICE = {
 }
 
 
+def hides(known: str) -> bool:
+    """Whether observations stand for several states, by what is known of a world, or why it is not."""
+    return re.search("its observations|observations stand for|beliefs about", known) is not None
+
+
 def hidden(seen: Seen) -> tuple[str, str] | None:
     """The evidence and the advice; None where nothing is found."""
     known, steps = seen.refusal if seen.mdp is None else seen.mdp.truth, seen.steps
-    found = _by_states(seen) if re.search(_ALIASED, known) else None
+    found = _by_states(seen) if hides(known) else None
     if not (found or seen.mdp is not None or steps.draws):
         found = _by_conflict(seen)
     if found and _BEFORE in found[0] and (steps.after == steps.before)[steps.first].all():

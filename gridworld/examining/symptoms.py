@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from gymnasium import spaces
 
-from gridworld.examining.hidden import hidden, pays_totals
+from gridworld.examining.hidden import hidden, hides, pays_totals
 from gridworld.examining.sampling import LONGEST, parts_of
 from gridworld.examining.seen import ENDINGS, ERROR, UNLIMITED, WARNING, EnvFinding, Seen
 from gridworld.world.metrics import wilson_interval
@@ -188,6 +188,8 @@ def _reward(seen: Seen) -> Iterator[EnvFinding]:
     ):
         paid = "rewards do not depend on what is done"
         paid = paid if len(values) > 1 else f"{states} pays more than {seen.usual + 0.0:g}"
+        if len(values) > 1 and hides(mdp.truth):
+            paid, advice = f"{paid}, on average over what is hidden", f"show what decides them, or {advice}"
         evidence = f"{paid}, and every policy returns {seen.returns[0] + 0.0:.4g} (exact)."
         yield EnvFinding("reward", ERROR, evidence, advice)
     elif mdp is not None and reach is None and mdp.goal.any() and not mdp.is_enumerated:

@@ -570,6 +570,7 @@ def test_a_hidden_goal_is_named_where_each_observation_stands_for_one_belief() -
     result = examine(HiddenSide, steps=STEPS)
     assert "7 beliefs about 10 hidden states" in fact(result, "states")
     assert "depend on what is drawn at reset (goal), which is not observed" in evidence(result, "markov")
+    assert "depend on what is done, on average over what is hidden, and" in evidence(result, "reward")
 
 
 class StepsOnItsOwnSample(Walk):
