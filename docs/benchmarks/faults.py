@@ -310,11 +310,9 @@ def table(rows: Rows, every: Path) -> Iterator[str]:
         spoilt = sum(not row["certified"] for row in mine)
         failed = by_class.get(fault.change)
         is_killed = killed_by_rewards(mine, of[f"sound {fault.agent}"])
-        instead_of_it = ", ".join(f"{cause} {count}" for cause, count in instead.items())
         probes_failed = "" if failed is None else len(failed) or "passes"
-        title = fault.title.split(" | ")
-        counts = (half(fault), spoilt, len(mine), right, instead_of_it, probes_failed)
-        lines.append((*title, *counts, "killed" if is_killed else ""))
+        counts = (half(fault), spoilt, len(mine), right, _listed(instead).replace("`", ""), probes_failed)
+        lines.append((*fault.title.split(" | "), *counts, "killed" if is_killed else ""))
         for key in ((fault.source, half(fault)), ("all", half(fault)), ("all", "both")):
             totals[key].update(
                 faults=1, runs=len(mine), spoilt=spoilt, right=right, classes=failed is not None,

@@ -186,10 +186,12 @@ def _reward(seen: Seen) -> Iterator[EnvFinding]:
         and seen.returns is not None
         and np.ptp(seen.returns) <= _ALIKE * np.abs(mdp.reward).max()
     ):
-        paid = "rewards do not depend on what is done"
-        paid = paid if len(values) > 1 else f"{states} pays more than {seen.usual + 0.0:g}"
-        if len(values) > 1 and hides(mdp.truth):
-            paid, advice = f"{paid}, on average over what is hidden", f"show what decides them, or {advice}"
+        paid = f"{states} pays more than {seen.usual + 0.0:g}"
+        if len(values) > 1:
+            paid = "rewards do not depend on what is done"
+            if hides(mdp.truth):
+                paid += ", on average over what is hidden"
+                advice = f"show what decides them, or {advice}"
         evidence = f"{paid}, and every policy returns {seen.returns[0] + 0.0:.4g} (exact)."
         yield EnvFinding("reward", ERROR, evidence, advice)
     elif mdp is not None and reach is None and mdp.goal.any() and not mdp.is_enumerated:

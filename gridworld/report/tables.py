@@ -270,11 +270,11 @@ def answer_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
 
 def steps_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
     """The median steps until certified for good, agents down and tasks across."""
-    found = [(task.task, result) for task in tasks for result in task.results]
-    medians = [result.estimates.get(("steps", "median")) for _, result in found]
     cells = {
-        (result.group.agent, task): None if median is None else median.point
-        for (task, result), median in zip(found, medians, strict=True)
+        (result.group.agent, task.task): median.point
+        for task in tasks
+        for result in task.results
+        if (median := result.estimates.get(("steps", "median"))) is not None
     }
     return _grid("steps", "Steps until certified for good, median", study, cells)
 

@@ -76,9 +76,10 @@ def check(job: plan.Job) -> None:
 
 def repeat(found: list[rows.Row], count: int) -> None:
     """Train some rows, drawn at random, again from nothing."""
-    for row in random.sample(found, min(count, len(found))):
-        [world] = [world for world in plan.worlds_of(row.page) if world.name == row.world]
-        again = rows.run(plan.Job(*row[:3], world, int(row.seed)))
+    pairs = [(row, plan.Job(*row[:3], w, int(row.seed))) for row in found for w in plan.worlds_of(row.page)]
+    known = [(row, job) for row, job in pairs if job.key == row[: plan.KEY]]
+    for row, job in random.sample(known, min(count, len(known))):
+        again = rows.run(job)
         if again._replace(seconds=row.seconds) != row:
             raise InputError(f"repeat: the row is {row}\nand now {again}")
         print(f"{' '.join(row[:5])}: the same", flush=True)

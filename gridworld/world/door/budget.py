@@ -29,7 +29,11 @@ class Budget:
         self._line, self._due = ProgressLine(enabled=True, seconds_between_lines=_BETWEEN_LINES), _FIRST
         self._growing = ""
         self.is_explored = False  # then its environment is as it was, and not to be touched
-        self.num_bytes, self.most_now = 0, most_states
+        self.begin()
+
+    def begin(self) -> None:
+        """Nothing is found yet, as where a search begins again."""
+        self.num_bytes, self.most_now = 0, self.most_states
 
     def seconds_left(self) -> float:
         """Of those that it may take."""

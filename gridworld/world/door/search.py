@@ -205,7 +205,7 @@ class Search:
         self._ended: set[bytes] = set()
         self._waiting_ends: list[bytes] = []  # copies of new ends, from which no reset was tried yet
         budget, most_states = self.budget, self.budget.most_states
-        budget.num_bytes, budget.most_now = 0, most_states
+        budget.begin()
         self.first = first = self.layers.take()
         if unknown := [each for each in self.ignore if each not in self.layers.names()]:
             self.merged(functools.partial(self.reset_from, first))  # which may make it
