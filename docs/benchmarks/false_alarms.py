@@ -81,7 +81,7 @@ def shares(name: str, seeds: range) -> dict[str, np.ndarray]:
                 config, probes[0].world, probes[0].gamma, chosen[1].num_envs, chosen[1].steps, seed
             )
             for probe in probes:
-                found.setdefault(probe.name, []).append(share(probe, trained))
+                found.setdefault(probe.name, []).append(share(probe, probe.asked(trained)))
     return {name: np.array(each) for name, each in found.items()}
 
 

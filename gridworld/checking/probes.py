@@ -125,17 +125,19 @@ SLIPPERY = _world(
         [_sure(0, 0, GOES_ON), [(0.8, 2, 1.0, ENDS), (0.2, 1, 0.0, GOES_ON)]],
     ],
 )
-# Three parts, each with a start. From state 0, action 0 takes the longer way, three steps that cost 0.5 each,
-# action 1 the shorter one, which costs 1. From state 3, action 0 pays 1, action 1 leads to where 3 is paid.
-# From state 5, action 0 costs 5 and leads to where 1 is paid, action 1 costs 1 and ends.
+# Four parts, each with a start. From state 0, action 0 takes the longer way, three steps that cost 1 each,
+# action 1 the shorter one, which costs 2.3. From state 3, action 0 costs 0.5 and ends, action 1 leads to
+# where action 0 costs 2 and action 1 nothing. From state 5, action 0 pays 3, action 1 leads to where 5 is
+# paid. From state 7, action 0 costs 5 and leads to where 1 is paid, action 1 costs 3 and ends.
 COSTS_AND_LARGE = _world(
     "costs and large rewards",
     [
-        *([_sure(1, -0.5, GOES_ON), _sure(7, -1, ENDS)], _any(2, -0.5, GOES_ON), _any(7, -0.5, ENDS)),
-        *([_sure(7, 1, ENDS), _sure(4, 0, GOES_ON)], _any(7, 3, ENDS)),
-        *([_sure(6, -5, GOES_ON), _sure(7, -1, ENDS)], _any(7, 1, ENDS)),
+        *([_sure(1, -1, GOES_ON), _sure(9, -2.3, ENDS)], _any(2, -1, GOES_ON), _any(9, -1, ENDS)),
+        *([_sure(9, -0.5, ENDS), _sure(4, 0, GOES_ON)], [_sure(9, -2, ENDS), _sure(9, 0, ENDS)]),
+        *([_sure(9, 3, ENDS), _sure(6, 0, GOES_ON)], _any(9, 5, ENDS)),
+        *([_sure(8, -5, GOES_ON), _sure(9, -3, ENDS)], _any(9, 1, ENDS)),
     ],
-    start=(0.75, 0.0, 0.0, 0.125, 0.0, 0.125),
+    start=(0.5, 0.0, 0.0, 0.25, 0.0, 0.125, 0.0, 0.125),
 )
 
 
@@ -259,7 +261,7 @@ def _near(
     error = np.where(where, np.abs(found - exact), -1.0)
     worst = tuple(int(each) for each in np.unravel_index(np.argmax(error), error.shape))
     name = "P" if probability else "Q" if len(worst) == 2 else "V"
-    text = f"{name}({', '.join(map(str, worst))}) {found[worst]:.3f}, exact {exact[worst]:.3f}"
+    text = f"{name}({', '.join(map(str, worst))}) {found[worst]:z.3f}, exact {exact[worst]:z.3f}"
     if not error[worst] <= tolerance:
         raise UnmetError(f"{text}, tolerance {tolerance:.2g}")
     return text
@@ -284,14 +286,18 @@ class Probe:
         """Probes with the same one share a training run."""
         return self.world.digest(), self.gamma, repr(self.arguments)
 
+    def asked(self, trained: Trained) -> Trained:
+        """The same, where its world begins in the states that the probe asks from."""
+        mdp = trained.mdp
+        if not self.starts:
+            return trained
+        start = np.zeros(mdp.num_states)
+        start[list(self.starts)] = 1 / len(self.starts)
+        return replace(trained, mdp=replace(mdp, start=frozen(start)))
+
     def found(self, trained: Trained) -> str:
         """What was found where it holds; raises `UnmetError`, or `UnknownError`."""
-        mdp = trained.mdp
-        if self.starts:
-            start = np.zeros(mdp.num_states)
-            start[list(self.starts)] = 1 / len(self.starts)
-            trained = replace(trained, mdp=replace(mdp, start=frozen(start)))
-        return self.holds(trained)
+        return self.holds(self.asked(trained))
 
 
 _NO_EXPLORATION_LEFT = {"exploration_final_eps": 0.0}
@@ -352,12 +358,12 @@ PROBES = (
           "the value of the next state is not that of its best action",
           follows=(*_BASIC, "delay")),
     Probe("costs", COSTS_AND_LARGE, optimal_with_values,
-          "values below 0 are lost (the largest is searched from 0, the output is never negative, or targets "
-          "are cut off at 0), or rewards are shifted",
-          starts=(0,), follows=(*_BASIC, "delay", "trap")),
+          "values below 0 are lost (the largest is searched from 0 or -1, or by size without its sign, the "
+          "output is never negative, or targets are cut off at 0), or rewards are shifted",
+          starts=(0, 3), follows=(*_BASIC, "delay", "trap")),
     Probe("large", COSTS_AND_LARGE, optimal_with_values,
-          "rewards or targets beyond 1 are changed: clipped, replaced by their sign, or normalised",
-          starts=(3, 5), follows=(*_BASIC, "delay", "trap", "costs")),
+          "rewards or targets beyond 1 are changed: clipped, replaced by their sign, normalised or shifted",
+          starts=(5, 7), follows=(*_BASIC, "delay", "trap", "costs")),
     Probe("slip", SLIPPERY, optimal_with_values,
           "random transitions are not averaged over, or next states are wrong",
           follows=(*_BASIC, "delay", "stochastic", "alternation")),

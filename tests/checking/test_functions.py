@@ -168,6 +168,16 @@ def test_a_bug_in_them_is_found(kind: str, bug: str) -> None:
     assert passed is False, text
 
 
+LARGEST: dict[str, Any] = {  # how a bug finds the largest of some values
+    "from 0": lambda q: max(0.0, q.max()),
+    "from -1": lambda q: max(-1.0, q.max()),
+    "by size": lambda q: q[np.abs(q).argmax()],
+    "not 0": lambda q: q[q != 0].max(initial=-np.inf) if q.any() else 0.0,
+    "above 0": lambda q: q.max() if q.max() > 0 else q.min(),
+}
+LIMITS = {"beyond 1": 1, "beyond 2": 2, "beyond 3": 3}  # of rewards
+
+
 def q_learning(env: Any, steps: int, seed: int, gamma: float, bug: str) -> np.ndarray:
     """Q-learning, Q by states and actions."""
     rng = np.random.default_rng(seed)
@@ -178,14 +188,13 @@ def q_learning(env: Any, steps: int, seed: int, gamma: float, bug: str) -> np.nd
         action = int(rng.integers(q.shape[1]) if explores else q[state].argmax())
         following, reward, terminated, truncated, _ = env.step(action)
         mean += (reward - mean) / (step + 1)
-        if bug == "rewards":
-            reward = np.clip(reward, -1, 1)
+        reward = np.clip(reward, -(limit := LIMITS.get(bug, np.inf)), limit)
         if bug == "mean":
             reward -= mean
         if bug == "double":
             reward *= 2
         over = terminated or (truncated and bug == "limits")
-        best = max(0.0, q[following].max()) if bug == "best" else q[following].max()
+        best = LARGEST.get(bug, np.max)(q[following])
         target = reward + (0.0 if over else gamma * best)
         if bug == "targets":
             target = max(0.0, target)
@@ -199,22 +208,19 @@ def q_learning(env: Any, steps: int, seed: int, gamma: float, bug: str) -> np.nd
 @pytest.mark.parametrize(
     ("bug", "failed"),
     [
-        *[("", []), ("best", ["costs"]), ("rewards", ["large"]), ("mean", ["costs"])],
-        ("targets", ["costs", "large"]),
+        *[("", []), ("mean", ["costs"]), ("targets", ["costs", "large"])],
+        *[(bug, ["costs"]) for bug in LARGEST],
+        *[(bug, ["large"]) for bug in LIMITS],
     ],
 )
 def test_values_below_0_and_rewards_beyond_1(bug: str, failed: list[str]) -> None:
-    """By its policy alone, too, of a learner that takes no discount."""
+    """By its policy alone, of a learner that takes no discount."""
     result = gridworld.check(
         lambda env, steps, seed: q_learning(env, steps, seed, 0.95, bug).argmax(axis=1),
         probes=["trap", "costs", "large"],
+        steps=5000,
     )
     assert result.failed == failed, str(result)
-    result = gridworld.check(
-        lambda env, steps, seed, gamma: {"q": q_learning(env, steps, seed, gamma, bug)},
-        probes=["trap", "costs", "large"],
-    )
-    assert set(failed) <= set(result.failed), str(result)
 
 
 @pytest.mark.slow
