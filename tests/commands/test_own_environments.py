@@ -16,8 +16,8 @@ from stable_baselines3 import A2C, DQN
 
 import gridworld
 
-# Gymnasium's tutorial in our words: a goal that is drawn until it is not the agent's cell. Then what shows
-# images, and what shows several numbers.
+# Gymnasium's tutorial in our words: a goal that is drawn until it is not the agent's cell; the same by one
+# draw; what shows several numbers, and what shows images.
 MODULE = """
 import gymnasium as gym
 import numpy as np
@@ -72,8 +72,20 @@ class Pixels(Corridor):
         return pixels
 
 
+class Drawn(Goals):
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        cells = self.np_random.permutation(self.size**2)[:2]
+        self.agent, self.target = (np.array(divmod(cell, self.size)) for cell in cells)
+        return {"agent": self.agent, "target": self.target}, {}
+
+
+def small():
+    return Drawn(2)
+
+
 def shortened(limit=20):
-    return gym.wrappers.TimeLimit(Goals(), limit)
+    return gym.wrappers.TimeLimit(small(), limit)
 
 
 NUMBER = 3
@@ -105,9 +117,9 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     ("words", "states", "limit"),
     [
         (["env=goals:Goals"], 81, 100),
-        (["env=goals.py:Goals"], 81, 100),
-        (["env=goals:Goals", "env.kwargs.size=2"], 16, 100),
-        (["env=goals:shortened", "env.kwargs.limit=7"], 81, 7),
+        (["env=goals.py:small"], 16, 100),
+        (["env=goals:Drawn", "env.kwargs.size=2"], 16, 100),
+        (["env=goals:shortened", "env.kwargs.limit=7"], 16, 7),
         (["env=goals:Corridor", "env.ignore=[way]"], None, None),
         (["env=FrozenLake-v1"], 16, 100),
     ],
@@ -126,15 +138,15 @@ def test_a_name_is_enough(words: list[str], states: int | None, limit: int | Non
 def test_a_file_may_have_the_name_of_another_module(here: Path) -> None:
     for name in ("gridworld.py", "json.py", "test.py"):
         (here / name).write_text(MODULE)
-        assert gridworld.compile_env(f"{name}:Goals").num_states == 81
+        assert gridworld.compile_env(f"{name}:small").num_states == 16
     assert gridworld.compile_mdp is sys.modules["gridworld"].compile_mdp
 
 
 def test_bounds_and_the_users_word(here: Path) -> None:
     with pytest.raises(gridworld.InputError, match="more than 50 states can be reached"):
         gridworld.compile_env("goals:Goals", most_states=50)
-    mdp = gridworld.compile_env("goals:Goals", state=lambda env: (env.agent.tolist(), env.target.tolist()))
-    assert mdp.num_states == 81
+    mdp = gridworld.compile_env("goals:small", state=lambda env: (env.agent.tolist(), env.target.tolist()))
+    assert mdp.num_states == 16
     assert "state= says all" in mdp.truth
     with pytest.raises(gridworld.InputError, match=r"must be a list of names, \['moves'\]"):
         gridworld.compile_env("goals:Goals", ignore="moves")
@@ -144,7 +156,7 @@ def test_bounds_and_the_users_word(here: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "agent", "kind"), [("Goals", "dqn", DQN), ("Corridor", "a2c", A2C), ("Pixels", "dqn", DQN)]
+    ("name", "agent", "kind"), [("small", "dqn", DQN), ("Corridor", "a2c", A2C), ("Pixels", "dqn", DQN)]
 )
 def test_a_model_fits_the_environment_that_it_was_trained_on(
     name: str, agent: str, kind: Any, here: Path
@@ -171,7 +183,7 @@ def test_a_model_fits_the_environment_that_it_was_trained_on(
 
 @pytest.mark.slow
 def test_a_run_on_a_dict_goes_on_as_if_it_had_not_stopped(here: Path) -> None:
-    words = ("agent=dqn", "env=goals:Goals", "observation=own", "checkpoint.every=300", *SHORT)
+    words = ("agent=dqn", "env=goals:small", "observation=own", "checkpoint.every=300", *SHORT)
     assert script("train.py", *words, "hydra.run.dir=whole", cwd=here).returncode == 0
     stopped_after(2, here / "part", *words)
     done = script("train.py", "resume=part", cwd=here)
@@ -185,7 +197,7 @@ def test_a_run_on_a_dict_goes_on_as_if_it_had_not_stopped(here: Path) -> None:
 @pytest.mark.slow
 def test_a_run_of_somebody_elses_is_opened_without_its_module(here: Path) -> None:
     """The current folder is searched for names that were typed, never for those of a run."""
-    words = ("agent=q_learning", "env=goals:Goals", "hydra.run.dir=run", *SHORT)
+    words = ("agent=q_learning", "env=goals:small", "hydra.run.dir=run", *SHORT)
     assert script("train.py", *words, cwd=here).returncode == 0
     (here / "goals.py").write_text("open('was_imported', 'w').close()\n" + MODULE)
     for command in (
@@ -201,8 +213,8 @@ def test_a_run_of_somebody_elses_is_opened_without_its_module(here: Path) -> Non
 
 @pytest.mark.slow
 def test_a_sweep_over_environments(here: Path) -> None:
-    words = ("-m", "agent=q_learning", "env=goals:Goals,goals:Corridor", "hydra.sweep.dir=swept", *SHORT)
+    words = ("-m", "agent=q_learning", "env=goals:small,goals:Corridor", "hydra.sweep.dir=swept", *SHORT)
     done = script("train.py", *words, cwd=here)
     assert done.returncode == 0, done.stderr
     found = sorted(json.loads(file.read_text())["env"] for file in here.glob("swept/*/summary.json"))
-    assert found == ["goals:Corridor", "goals:Goals"]
+    assert found == ["goals:Corridor", "goals:small"]

@@ -77,6 +77,7 @@ def test_the_world_is_known_before_a_recipe_is_chosen() -> None:
 SAME = ("gymnasium", "enumerated")
 
 
+@pytest.mark.slow
 def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
     """In a run and in a sweep alike."""
     for name in ("tuned/q_learning/icy", "tuned/q_learning/cliff"):

@@ -273,7 +273,9 @@ KILLED_IN = {  # functions, in the order in which an export calls them
 }
 
 
-@pytest.mark.parametrize("to", ["wandb", pytest.param("mlflow", marks=pytest.mark.slow), "hub"])
+@pytest.mark.parametrize(
+    "to", [*(pytest.param(to, marks=pytest.mark.slow) for to in ("wandb", "mlflow")), "hub"]
+)
 def test_an_export_that_is_killed_is_whole_after_the_same_command(to: str, place: Path) -> None:
     """Killed in each of these functions, one export after the other."""
     program = f"""if True:

@@ -137,6 +137,7 @@ def test_the_hparams_table_opens_with_what_varies_and_the_results(served_sweep: 
     assert [info["name"]["tag"] for info in table["metricInfos"]][: len(RESULTS)] == RESULTS
 
 
+@pytest.mark.slow
 def test_a_sweep_has_every_run_by_its_name_with_its_metrics(served_sweep: str) -> None:
     assert ask(served_sweep, "data/plugin/scalars/tags").keys() == SWEPT | OVER_SEEDS
     groups = hparams_table(served_sweep)

@@ -12,7 +12,6 @@ from gymnasium import spaces
 from gymnasium.envs.toy_text import blackjack
 
 from gridworld.base.errors import InputError
-from gridworld.config.worlds import GymnasiumConfig
 from gridworld.world.door import beliefs, known
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
@@ -263,15 +262,6 @@ def test_blackjack_with_few_cards_is_as_good_as_by_its_rules(
 def test_hands_are_summed_up_only_for_the_known_class() -> None:
     assert known.state_reader(blackjack.BlackjackEnv()) is not None
     assert known.state_reader(type("BlackjackEnv", (blackjack.BlackjackEnv,), {})()) is None
-
-
-@pytest.mark.slow
-def test_blackjack_is_worth_what_it_is_worth() -> None:
-    deck = [*range(1, 11), 10, 10, 10]
-    mdp = GymnasiumConfig(id="Blackjack-v1", kwargs={"sab": False}).compile()
-    value = Evaluator(mdp, 1.0, 100).optimal_value
-    assert value == pytest.approx(cards(deck, False), abs=1e-12)
-    assert value == pytest.approx(-0.0465559770667, abs=1e-9)
 
 
 class Hidden(World):

@@ -172,6 +172,7 @@ def test_minigrid_has_a_state_for_every_position_and_time(empty: Mdp) -> None:
     assert walk_beside(empty, gym.make(MINIGRID, max_steps=LIMIT), 2000, "image") > 5
 
 
+@pytest.mark.slow
 def test_the_optimum_of_minigrid_is_the_shortest_way_by_its_formula(empty: Mdp) -> None:
     judge = Evaluator(empty, 1.0, LIMIT)
     # two ahead, a turn, two ahead

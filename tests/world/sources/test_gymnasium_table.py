@@ -72,9 +72,7 @@ def outcomes(mdp):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["frozen_lake", "slippery_lake", "cliff_walking", "slippery_cliff", "rainy_taxi"]
-)
+@pytest.mark.parametrize("name", ["frozen_lake", "slippery_lake", "cliff_walking", "slippery_cliff", "taxi"])
 def test_the_table_is_what_a_search_finds(world, name):
     env_id, kwargs, _ = EVERY[name]
     table, searched = outcomes(world(name)[0]), outcomes(compile_id(env_id, kwargs, by_table=False))
