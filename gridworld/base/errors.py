@@ -33,6 +33,10 @@ class FolderLostError(InputError):
     """The folder that this run was at work in is gone, or is another process's by now."""
 
 
+class TooLargeError(InputError):
+    """A world has more states than may be tried, or takes longer."""
+
+
 def reason(error: BaseException) -> str:
     """What went wrong, for a sentence."""
     if isinstance(error, InputError):

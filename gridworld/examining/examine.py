@@ -114,7 +114,7 @@ def examine(env: Any, gamma: float = 0.99, *, steps: int = _STEPS, seed: int = 0
         started = time.monotonic()
         found = sample(make(), Actions(first.action_space, seed), steps, seed)
         rate, replayed = len(found.before) / max(time.monotonic() - started, 1e-3), Replays()
-        mdp, refusal = _exact(make) if mdp is None else (mdp, "")
+        mdp, refusal = _exact(make) if mdp is None else (mdp, None)
         try:
             replayed = replays(make, Actions(first.action_space, seed), found, rate)
         except Exception as error:  # anybody's code
@@ -202,14 +202,14 @@ def _interface(make: Make) -> str:
     return ""
 
 
-def _exact(make: Make) -> tuple[Mdp | None, str]:
+def _exact(make: Make) -> tuple[Mdp | None, InputError | None]:
     """The tables of an environment; or None, and why it cannot be enumerated in the time for it."""
     try:
-        return task_of(make(), most_states=_MOST_STATES, most_seconds=_SECONDS).mdp, ""
+        return task_of(make(), most_states=_MOST_STATES, most_seconds=_SECONDS).mdp, None
     except InputError as error:
-        return None, str(error).partition(": ")[2]
+        return None, error
     except Exception as error:  # of anybody's code
-        return None, f"it raises {in_short(error)}"
+        return None, InputError(f"env: it raises {in_short(error)}")
 
 
 def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
@@ -220,7 +220,8 @@ def _facts(seen: Seen) -> Iterator[tuple[str, str]]:
     if mdp is not None:
         yield "states", f"{mdp.reachable.sum():,} can be reached; known {mdp.scope}"
     else:
-        yield "states", f"not enumerated, so what follows is of a sample; {seen.refusal}"
+        why = str(seen.refusal).partition(": ")[2]
+        yield "states", f"not enumerated, so what follows is of a sample; {why}"
     starts = len(np.unique(steps.before[steps.first]))
     met = f"{seen.observed:,} different ones in {len(steps.before):,} steps, {starts:,} at the start"
     yield "observations", f"{met}; {' '.join(str(seen.env.observation_space).split())}"

@@ -17,13 +17,14 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from gridworld.base.errors import TooLargeError
 from gridworld.examining.seen import Seen
 from gridworld.world.door.attributes import differing, held_by, is_plain
 from gridworld.world.door.beliefs import summed
 from gridworld.world.door.counters import counted
 from gridworld.world.door.known import state_reader
 from gridworld.world.door.search import Search, State
-from gridworld.world.mdp import BoolArray, IntArray
+from gridworld.world.mdp import BoolArray, IntArray, Mdp
 from gridworld.world.shown import content
 
 _MOST_STATES, _SECONDS = 20_000, 10.0  # of a search
@@ -43,15 +44,16 @@ _ADVICE = {
 }
 
 
-def hides(known: str) -> bool:
-    """Whether observations stand for several states, by what is known of a world, or why it is not."""
-    return re.search("its observations|observations stand for|beliefs about", known) is not None
+def hides(mdp: Mdp) -> bool:
+    """Whether observations stand for several states."""
+    return re.search("observations stand for|beliefs about", mdp.truth) is not None
 
 
 def hidden(seen: Seen) -> tuple[str, str] | None:
     """The evidence and the advice; None where nothing is found."""
-    known, steps = seen.refusal if seen.mdp is None else seen.mdp.truth, seen.steps
-    found = _by_states(seen) if hides(known) else None
+    steps = seen.steps
+    may_hide = isinstance(seen.refusal, TooLargeError) if seen.mdp is None else hides(seen.mdp)
+    found = _by_states(seen) if may_hide else None
     if not (found or seen.mdp is not None or steps.draws):
         found = _by_conflict(seen)
     if found and _BEFORE in found[0] and (steps.after == steps.before)[steps.first].all():
@@ -81,10 +83,12 @@ def _by_states(seen: Seen) -> tuple[str, str] | None:
     try:
         search.explore()
     except Exception:  # its code may be anybody's
-        return None
+        if not getattr(search, "states", None):
+            return None  # nothing was tried
     known = (counted(search), seen.ends_at and seen.ends_at - 1, len(search.states))
     limit = min(each for each in known if each is not None)
     states = [each for each in search.states if each.steps and each.depth < limit]
+    tried = "" if search.budget.is_explored else f" of the first {len(states):,} states"
     entered = [(-1, -1, each) for each in search.resets.starts]
     entered += [
         (state.number, action, step)
@@ -131,7 +135,7 @@ def _by_states(seen: Seen) -> tuple[str, str] | None:
             break
     names = _names(search, conflicts)
     evidence = (
-        f"in {len(conflicts):,} of {len(alike):,} observations the same action has different outcomes "
+        f"in {len(conflicts):,} of {len(alike):,} observations{tried} the same action has different outcomes "
         f"(exact): they depend on {cause}{f' ({names})' if names else ''}, which is not observed."
     )
     return evidence, _ADVICE[cause].format(names or "what is missing")

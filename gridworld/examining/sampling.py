@@ -75,7 +75,7 @@ class Steps:
     failure: str  # what a step raised, if one did
     mistyped: str  # what is wrong with the type of a flag
     acts: list[Any]  # the actions by their numbers
-    largest: dict[str, float]  # the largest number in observations that SB3 takes for images, by their names
+    pixels: dict[str, set[int]]  # the numbers in observations that SB3 takes for images, by their names
 
     @property
     def last(self) -> IntArray:
@@ -105,6 +105,7 @@ class Actions:
 
     def __init__(self, space: gym.Space[Any], seed: int) -> None:
         self._space = copy.deepcopy(space)
+        seed = int(np.random.SeedSequence((seed, 1)).generate_state(1)[0])  # `reset` gets the seed itself
         self._space.seed(seed)
         if isinstance(space, spaces.Discrete):
             self.pool = [space.start + index for index in range(min(int(space.n), _POOL))]
@@ -153,7 +154,7 @@ def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
     vectors: list[FloatArray | None] = []
     outside: dict[int, str] = {}
     changed, draws, failure, mistyped, episode, until = 0, False, "", "", 0, time.monotonic() + _SECONDS
-    largest: dict[str, float] = {}
+    pixels: dict[str, set[int]] = {}
 
     def number(observation: Any, key: bytes) -> int:
         if key not in numbers:
@@ -164,7 +165,7 @@ def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
             vectors.append(_vector(parts))
             for name, space, part in parts:
                 if is_image(space) and isinstance(part, np.ndarray):
-                    largest[name] = max(largest.get(name, 0), np.max(part, initial=0))
+                    pixels.setdefault(name, set()).update(np.unique(part).tolist())
         return numbers[key]
 
     while len(rows) < most and time.monotonic() < until and not failure:
@@ -208,7 +209,7 @@ def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
         failure=failure,
         mistyped=mistyped,
         acts=taken_acts,
-        largest=largest,
+        pixels=pixels,
     )
 
 
@@ -274,8 +275,7 @@ def _shared(make: Callable[[], Env], actions: list[Any], usual: Play) -> list[st
     env, other = make(), make()
 
     def after_another() -> Held:
-        other.reset(seed=SEEDS[1])
-        other.step(copy.copy(actions[0]))
+        _play(other, actions, SEEDS[1], set())
         return _held(env)
 
     if _play(env, actions, SEEDS[0], set(), beside=other) == usual:

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from gymnasium import spaces
 
+from gridworld.base.errors import InputError
 from gridworld.examining.sampling import Env, Replays, Steps
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup
 
@@ -40,7 +41,7 @@ class Seen:
     interface: str  # what Gymnasium's checker says against it
     limit: int | None  # its step limit, if it is known
     mdp: Mdp | None  # its tables, if they are known exactly
-    refusal: str = ""  # why they are not
+    refusal: InputError | None = None  # why they are not
 
     @property
     def is_stochastic(self) -> bool:

@@ -20,7 +20,7 @@ _LEAST_REACHED = 1e-3  # of episodes of a random policy that come to the reward
 _ALIKE = 1e-9  # returns, relative to the largest reward
 _LEAST_LEFT = 0.05  # of the first reward under the discount
 _LARGE, _SMALL = 1e3, 1e-3  # rewards
-_DARK = 64  # the largest number of what is hardly an image
+_DARK, _CODES = 64, 16  # the largest number of what is hardly an image, and beside 255
 _LARGE_INPUT = 10.0  # root mean square of a number that is observed
 
 
@@ -49,11 +49,14 @@ def _spaces(seen: Seen) -> Iterator[EnvFinding]:
                 wrapper = f"gymnasium.wrappers.Transform{what.capitalize()}"
                 advice = f"let the space begin at 0 and move the numbers in step(), or use {wrapper}."
                 yield EnvFinding("space", WARNING, evidence, advice)
-    for name, largest in seen.steps.largest.items():
-        if 0 < largest < _DARK:
+    for name, pixels in seen.steps.pixels.items():
+        largest, has_white = max(pixels - {255}, default=0), 255 in pixels
+        if 0 < largest < (_CODES if has_white else _DARK):
+            apart = ", apart from 255," if has_white else ""
             evidence = (
                 f"observations{name} are uint8 from 0 to 255 with three axes, which SB3 takes for images and "
-                f"divides by 255; the largest number is {largest:g}, of which {largest / 255:.2g} is left."
+                f"divides by 255; the largest number{apart} is {largest}, of which {largest / 255:.2g} is "
+                "left."
             )
             advice = (
                 "give the Box its real bounds, show codes as one-hot vectors, or use SB3's "
@@ -189,7 +192,7 @@ def _reward(seen: Seen) -> Iterator[EnvFinding]:
         paid = f"{states} pays more than {seen.usual + 0.0:g}"
         if len(values) > 1:
             paid = "rewards do not depend on what is done"
-            if hides(mdp.truth):
+            if hides(mdp):
                 paid += ", on average over what is hidden"
                 advice = f"show what decides them, or {advice}"
         evidence = f"{paid}, and every policy returns {seen.returns[0] + 0.0:.4g} (exact)."

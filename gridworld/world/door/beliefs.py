@@ -99,7 +99,7 @@ class Beliefs:
     Args:
         starts: the probability of each hidden state and observation after a reset.
         steps: of each hidden state the outcomes of each action; empty where none was tried.
-        refusal: makes an error of a reason.
+        too_large: makes an error of a reason.
         most_seconds: the time after which it is given up.
         show: shows how far it is.
         limit: steps of an episode; of a few nodes more, what follows in them is not asked.
@@ -109,12 +109,12 @@ class Beliefs:
         self,
         starts: Iterable[tuple[Fraction, int, bytes]],
         steps: Sequence[Sequence[Sequence[Step]]],
-        refusal: Callable[[str], InputError],
+        too_large: Callable[[str], InputError],
         most_seconds: float,
         show: Callable[[str], None] = lambda what: None,
         limit: int | None = None,
     ) -> None:
-        self._refusal, self._most, self._num_parts = refusal, _MOST_NODES, 0
+        self._too_large, self._most, self._num_parts = too_large, _MOST_NODES, 0
         self._until = time.monotonic() + most_seconds
         self.nodes: list[Node] = []
         self._numbers: dict[tuple[Belief, bytes], int] = {}
@@ -171,12 +171,12 @@ class Beliefs:
             is_long = max(each.denominator.bit_length() for _, each in belief) > _MOST_BITS
             is_many = len(self.nodes) > self._most or self._num_parts > _MOST_PARTS or is_long
             if time.monotonic() > self._until:
-                raise self._refusal(
-                    f"its time is over: its observations show {len(self.nodes):,} situations so far, "
-                    "and there are more"
+                raise self._too_large(
+                    "its time is over before all is found that its observations leave open: "
+                    f"{len(self.nodes):,} situations so far, and there are more"
                 )
             if is_many:
-                raise self._refusal(
+                raise self._too_large(
                     "its observations do not show its state, and what histories say of it has no end in the "
                     f"size allowed: after {len(self.nodes):,} different distributions of {self._num_parts:,} "
                     "probabilities there are more; show more of the state, or set a limit "

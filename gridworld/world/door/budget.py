@@ -44,13 +44,13 @@ class Budget:
         search, self.num_bytes = self._search, self.num_bytes + size
         num_bytes = self.num_bytes + search.seen.num_bytes
         if len(search.states) > self.most_now:
-            raise search.refusal(
+            raise search.too_large(
                 f"more than {self.most_now:,} states can be reached, too many to solve, since its "
                 f"{self.what_changes()}"
             )
         if num_bytes > _MOST_BYTES:
             most = f"{_MOST_BYTES / 2**30:.0f} GiB"
-            raise search.refusal(f"copies of the first {len(search.states):,} states take more than {most}")
+            raise search.too_large(f"copies of the first {len(search.states):,} states take more than {most}")
         check_memory(search.where, num_bytes)
 
     def check_seconds(self, outcomes: int = 0) -> None:
@@ -58,12 +58,12 @@ class Budget:
         if self.seconds_left() < 0:
             size, search = len(self._search.states), self._search
             if outcomes >= size:  # so that is what took long
-                raise search.refusal(
+                raise search.too_large(
                     "a reset or a step has more random outcomes than can be tried in the time allowed: "
                     f"after {outcomes:,} there are more"
                 )
             more = f"{'env.' * self._is_by_settings}most_seconds={2 * self._most_seconds:g}"
-            raise search.refusal(
+            raise search.too_large(
                 f"after {self._most_seconds:g} s it still finds new states ({size:,} so far; {more} allows "
                 f"more), since its {self.what_changes()}"
             )

@@ -20,7 +20,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from gridworld.base.errors import GYMNASIUM, InputError, in_short, on_a_line
+from gridworld.base.errors import GYMNASIUM, InputError, TooLargeError, in_short, on_a_line
 from gridworld.world.door import known
 from gridworld.world.door.beliefs import Step, lumped
 from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES, SAMPLED, Budget
@@ -94,7 +94,7 @@ class Search:
         actions = env.action_space
         if not isinstance(actions, spaces.Discrete) or actions.start != 0 or actions.n > MOST_ACTIONS:
             raise self.refusal(
-                f"its actions are {actions}, must be Discrete(n), from 0 to {MOST_ACTIONS} - 1"
+                f"its actions are {actions}; must be Discrete(n) with n up to {MOST_ACTIONS:,}, from 0 on"
             )
         self.num_actions = int(actions.n)
         try:
@@ -111,6 +111,10 @@ class Search:
     def refusal(self, reason: str) -> InputError:
         """An error that says why there is no table of it."""
         return InputError(f"{self.where}: {reason}")
+
+    def too_large(self, reason: str) -> TooLargeError:
+        """An error that says what there is more of than may be tried."""
+        return TooLargeError(f"{self.where}: {reason}")
 
     def explore(self) -> None:
         """Find all states that can be reached, and what every action does there."""
@@ -227,7 +231,7 @@ class Search:
             if beyond is None and state.depth >= (limit or _DEEPEST):
                 if limit is None:
                     still = f"after {_DEEPEST:,} steps it still finds new states"
-                    raise self.refusal(f"{still}, since its {budget.what_changes()}")
+                    raise self.too_large(f"{still}, since its {budget.what_changes()}")
                 beyond, size = place, len(self.states)
                 most_states = min(most_states, size + _BEYOND)
             try:

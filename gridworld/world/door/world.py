@@ -90,7 +90,7 @@ class _World:
         starts = [(each.probability, classes[each.following], each.seen) for each in search.resets.starts]
         budget = search.budget
         self.beliefs = beliefs = Beliefs(
-            starts, [*first, []], search.refusal, budget.seconds_left(), budget.show, limit
+            starts, [*first, []], search.too_large, budget.seconds_left(), budget.show, limit
         )
         space, numbers, size = search.env.observation_space, *self._numbers()
         named: list[Named] = [(f"observation {number}", None) for number in range(size)]
