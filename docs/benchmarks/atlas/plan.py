@@ -187,12 +187,12 @@ class Job:
         settings = {} if is_default else settings_of(self.library, self.algorithm)
         base = self.library.partition("+")[0]
         found = {"library": base, "algorithm": self.algorithm, "steps": steps, "every": every}
-        if self.library == "engine":
+        if self.library == "engine" or (is_default and self.library == "sb3"):  # in its own loop
+            own_loop = ["agent.engine=stock"] if self.library == "sb3" else []
+            words = [*own_loop, *_words(self.algorithm, settings, self.world)]
+            diagnosed = {"diagnose": True} if is_default else {}
             scored = f"evaluation.gamma={self.gamma}"
-            return found | {"words": [*_words(self.algorithm, settings, self.world), scored]}
-        if is_default and self.library == "sb3":  # in its own loop, through this package, for `diagnose`
-            words = ["agent.engine=stock", *_words(self.algorithm, settings, self.world)]
-            return found | {"library": "engine", "words": words, "diagnose": True}
+            return found | {"library": "engine", "words": [*words, scored], **diagnosed}
         return found | {"settings": settings, "commit": LIBRARIES[self.library].source[1]}
 
     @property
