@@ -119,6 +119,7 @@ def test_the_default_settings_are_the_librarys_own(name: str) -> None:
     assert config.n_envs == 1
 
 
+@pytest.mark.slow
 def test_the_librarys_own_curves_have_tens_of_points() -> None:
     for env, agent in pairs().values():
         on_policy = re.fullmatch("(a2c|ppo|trpo)(_sb3_defaults)?", agent)

@@ -137,6 +137,7 @@ def test_an_offer_has_the_steps_that_it_trains_and_about_its_time(tmp_path: Path
     assert trained.summary["timesteps"] == 1024
 
 
+@pytest.mark.slow
 def test_many_large_updates_are_not_called_too_few(tmp_path: Path) -> None:
     words = ["agent=ppo", "n_envs=16", "agent.n_steps=32", "agent.batch_size=64", "total_timesteps=10000"]
     gridworld.train(*words, "agent.learning_rate=0.03", folder=tmp_path / "run", seed=0, progress=False)

@@ -79,6 +79,7 @@ def test_four_of_five_are_told_on_worlds_held_out(tmp_path: Path) -> None:
     assert counts["told"] >= 0.8 * (counts["told"] + counts["missed"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "fewest", "most"), [(64, 0, 2), (1, 3, 30)])
 def test_one_state_is_taught_alone(width: int, fewest: int, most: int) -> None:
     narrow = f"agent.policy_kwargs.net_arch=[{width}]"

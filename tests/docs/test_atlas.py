@@ -117,6 +117,7 @@ def test_defaults_have_their_causes_and_worlds(atlas: Any, tmp_path: Path) -> No
     assert len(atlas.plan.worlds_of("defaults")) == 40
 
 
+@pytest.mark.slow
 def test_the_pages_are_what_their_rows_give(atlas: Any, tmp_path: Path) -> None:
     for name in ("reference", "data"):
         (tmp_path / name).mkdir()

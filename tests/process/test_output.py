@@ -37,9 +37,9 @@ TRAIN = " ".join(["SCRIPT train.py", *SHORT["q_learning"], "hydra.run.dir=run"])
 @pytest.mark.parametrize(
     ("line", "code"),
     [
-        (f"set -o pipefail; {TRAIN} 2>&1 | true", 0),
+        pytest.param(f"set -o pipefail; {TRAIN} 2>&1 | true", 0, marks=pytest.mark.slow),
         (f"{TRAIN} >/dev/full 2>&1", 2),
-        (f"setsid {TRAIN} >&- 2>&- <&-", 0),
+        pytest.param(f"setsid {TRAIN} >&- 2>&- <&-", 0, marks=pytest.mark.slow),
     ],
     ids=["no reader", "no room", "no terminal and all closed"],
 )

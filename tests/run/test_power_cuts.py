@@ -69,8 +69,12 @@ def check_goes_on(folder: Path, words: list[str], calm: dict[str, Any]) -> None:
     assert differences(left_behind(folder), calm) == []
 
 
+OTHERS = [("auto", False), ("null", False), ("600", True)]
+
+
 @pytest.mark.parametrize(
-    ("every", "is_resumed"), [("600", False), ("auto", False), ("null", False), ("600", True)]
+    ("every", "is_resumed"),
+    [("600", False), *(pytest.param(*each, marks=pytest.mark.slow) for each in OTHERS)],
 )
 def test_a_run_goes_on_after_a_power_cut(every: str, is_resumed: bool, tmp_path: Path) -> None:
     words, run = [*WORDS, f"checkpoint.every={every}"], tmp_path / "disk" / "run"
