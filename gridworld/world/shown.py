@@ -182,13 +182,23 @@ class Seen:
         seen = whole if len(whole) <= 16 else hashlib.blake2b(whole, digest_size=17).digest()
         if seen not in self.parts:
             self.parts[seen] = parts
-            text = " ".join(str(observation).split())
+            shown = _plain(observation) if isinstance(observation, dict | tuple) else observation
+            text = " ".join(str(shown).split())
             self.texts[seen] = f"observation {text}" if len(text) <= _LONGEST_NAME else ""
             self.num_bytes += sum(each.nbytes for each in parts if isinstance(each, np.ndarray))
         with contextlib.suppress(TypeError):
             if may_be_met and all(isinstance(each, np.ndarray) for each in parts):  # by numbers alone
                 self._met[observation] = seen
         return seen
+
+
+def _plain(part: Any) -> Any:
+    """A part of an observation without arrays, as it can be read."""
+    if isinstance(part, dict):
+        return {key: _plain(each) for key, each in part.items()}
+    if isinstance(part, tuple):
+        return tuple(map(_plain, part))
+    return part.tolist() if isinstance(part, np.ndarray | np.generic) else part
 
 
 def _leaves(observation: Any, space: gym.Space[Any], refusal: Callable[[str], InputError]) -> Iterator[Any]:
