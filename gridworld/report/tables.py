@@ -22,6 +22,7 @@ from gridworld.report.tuning_study import TuningStudy
 
 NOTHING = "\N{EN DASH}"
 _MINUS = "\N{MINUS SIGN}"
+_SQUARES = "\N{LARGE RED SQUARE}\N{LARGE YELLOW SQUARE}\N{LARGE GREEN SQUARE}"  # for none, some, all
 # Signs with which a name out of a run's folder could be HTML, a link, a row, or the end of a marked place.
 _MARKS = re.compile(r"""[\\|<>&`\[\]*!\n\r]|:(?=//)|(?<=www)\.""")
 
@@ -119,10 +120,7 @@ def to_coloured_markdown(table: Table) -> str:
     def coloured(cell: Cell) -> Cell:
         if not isinstance(cell, Share):
             return "" if cell is None else cell
-        square = "\N{LARGE GREEN SQUARE}" if cell.is_whole else "\N{LARGE RED SQUARE}"
-        if 0 < cell.count < cell.total:
-            square = "\N{LARGE YELLOW SQUARE}"
-        return f"{square} {texts(cell)[0]}"
+        return f"{_SQUARES[(cell.count > 0) + cell.is_whole]} {texts(cell)[0]}"
 
     return to_markdown(dataclasses.replace(table, rows=[list(map(coloured, row)) for row in table.rows]))
 
@@ -187,28 +185,14 @@ def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
     """The main results on all tasks; also the table for a README. `reasons` are of runs not certified."""
     shown = [("regret", "iqm"), ("steps", "median"), ("first", "median")]
     columns = ["task", "agent", "seeds certified", "ever certified", *(_HEADINGS[which] for which in shown)]
-    columns += ["why not"] if reasons else []
-    rows: list[list[Cell]] = []
-    for task, result in [(each, result) for each in tasks for result in each.results]:
-        estimates = [estimate(result, *which) for which in shown]
-        rows.append([task.task, result.group.agent, result.certified, result.ever, *estimates])
-        if reasons:  # the most common cause of those that are not certified
-            causes = Counter(reasons[run.folder].cause for run in result.group.runs if run.folder in reasons)
-            most = [f"{cause} ({count} of {causes.total()})" for cause, count in causes.most_common(1)]
-            rows[-1].append("".join(most))
+    results, rows = [result for task in tasks for result in task.results], list[list[Cell]]()
+    for result in results:
+        causes = Counter(reasons[run.folder].cause for run in result.group.runs if run.folder in reasons)
+        most = [f"{cause} ({count} of {causes.total()})" for cause, count in causes.most_common(1)]
+        rows.append([result.group.task, result.group.agent, result.certified, result.ever])
+        rows[-1] += [*(estimate(result, *which) for which in shown), "".join(most)]
     caption = "Certified seeds, exact regret and steps, with 95 % intervals"
-    return _table_of([result for task in tasks for result in task.results], "results", caption, columns, rows)
-
-
-def _table_of(
-    results: Sequence[Result], name: str, caption: str, columns: list[str], rows: list[list[Cell]]
-) -> Table:
-    """A table with a row for each result, and columns of their privileges and scopes where any has some."""
-    for heading, what in (("privileges", "privileges"), ("the world is known", "scope")):
-        found = [getattr(result.group, what) for result in results]
-        if any(found):
-            columns, rows = [*columns, heading], [[*row, found[at]] for at, row in enumerate(rows)]
-    return Table(name, caption, columns, rows)
+    return _table_of(results, "results", caption, [*columns, "why not"], rows)
 
 
 def task_table(task: TaskAnalysis) -> Table:
@@ -223,13 +207,23 @@ def task_table(task: TaskAnalysis) -> Table:
 
 def scores_table(task: TaskAnalysis) -> Table:
     """Means over seeds of the other metrics that the runs have."""
-    keys = [key for key in _SCORES if any(len(result.samples[key]) for result in task.results)]
     rows: list[list[Cell]] = [
-        [result.group.agent, *(estimate(result, key, "mean") for key in keys)] for result in task.results
+        [result.group.agent, *(estimate(result, key, "mean") for key in _SCORES)] for result in task.results
     ]
     caption = f"Means over seeds on {task.task}, of the greedy policy unless stated otherwise"
-    columns = ["agent", *(METRICS[key].title for key in keys)]
+    columns = ["agent", *(METRICS[key].title for key in _SCORES)]
     return _table_of(task.results, f"{task.task} scores", caption, columns, rows)
+
+
+def _table_of(
+    results: Sequence[Result], name: str, caption: str, columns: list[str], rows: list[list[Cell]]
+) -> Table:
+    """A table with a row for each result, with privileges and scope; an empty column is left out."""
+    columns = [*columns, "privileges", "the world is known"]
+    for row, result in zip(rows, results, strict=True):
+        row += [result.group.privileges, result.group.scope]
+    shown = [at for at in range(len(columns)) if any(row[at] not in (None, "") for row in rows)]
+    return Table(name, caption, [columns[at] for at in shown], [[row[at] for at in shown] for row in rows])
 
 
 def estimate(result: Result, key: str, statistic: str) -> IntervalCell | None:
@@ -243,12 +237,8 @@ def improvement_tables(comparisons: Comparisons, name: str) -> Iterator[Table]:
     """The probabilities that the row's agent is better than the column's on the task, by metric."""
     for key in dict.fromkeys(key for key, _, _ in comparisons):
         title, agents = METRICS[key].title, sorted({one for other, one, _ in comparisons if other == key})
-        rows: list[list[Cell]] = []
-        for one in agents:
-            found = (comparisons.get((key, one, other)) for other in agents)
-            rows.append(
-                [one, *(None if each is None else IntervalCell(each, "{:.2f}".format) for each in found)]
-            )
+        found = {pair: IntervalCell(each, "{:.2f}".format) for pair, each in comparisons.items()}
+        rows: list[list[Cell]] = [[one, *(found.get((key, one, each)) for each in agents)] for one in agents]
         caption = f"Probability that a run of the row's agent beats one of the column's in {title}"
         yield Table(f"{name} improvement in {title}", caption, ["agent", *agents], rows)
 
@@ -264,18 +254,14 @@ def overall_table(overall: Overall) -> Table:
 
 def answer_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
     """Seeds certified at the end, agents down and tasks across."""
-    cells = {(result.group.agent, task.task): result.certified for task in tasks for result in task.results}
+    cells = {(each.group.agent, task.task): each.certified for task in tasks for each in task.results}
     return _grid("certified", "Seeds certified optimal at the end", study, cells)
 
 
 def steps_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
     """The median steps until certified for good, agents down and tasks across."""
-    cells = {
-        (result.group.agent, task.task): median.point
-        for task in tasks
-        for result in task.results
-        if (median := result.estimates.get(("steps", "median"))) is not None
-    }
+    results = [(task.task, result) for task in tasks for result in task.results]
+    cells = {(each.group.agent, task): each.estimates["steps", "median"].point for task, each in results}
     return _grid("steps", "Steps until certified for good, median", study, cells)
 
 
@@ -288,13 +274,13 @@ def runs_table(study: Study) -> Table:
     """A row for each run that is counted."""
     rows: list[list[Cell]] = []
     for group, run in study.runs:
-        since, first = (
-            int(step) if math.isfinite(step) else None
-            for step in (run.certified_since_step, run.first_certified_step)
+        certified, steps = (
+            "yes" if run.certified else "no",
+            (run.certified_since_step, run.first_certified_step),
         )
-        certified = "yes" if run.certified else "no"
         rows.append([group.task, group.agent, run.recipe or NOTHING, run.seed, certified, run.regret])
-        rows[-1] += [run.proven_regret, since, first, run.steps, run.seconds, str(run.folder)]
+        rows[-1] += [run.proven_regret, *(int(step) if math.isfinite(step) else None for step in steps)]
+        rows[-1] += [run.steps, run.seconds, str(run.folder)]
     columns = ["task", "agent", "recipe", "seed", "certified", "regret", "proven regret", "certified since"]
     columns += ["first certificate", "steps", "seconds"]
     return Table("runs", "All runs that are counted", [*columns, "folder"], rows)
@@ -333,13 +319,13 @@ def tuning_tables(tuning: TuningStudy) -> tuple[Table, Table, Table]:
         [key, str(value), str(tuning.began_from.get(key, "")), tuning.importances.get(key)]
         for key, value in tuning.values.items()
     ]
-    others = ("certified", "steps", "regret", "seconds", "error")
-    rows: list[list[Cell]] = [
+    columns = ["certified", "steps", "regret", "seconds", "error", *tuning.space]
+    trials: list[list[Cell]] = [
         [
             str(trial.number),
             trial.status,
             trial.score if math.isfinite(trial.score) else None,
-            *(trial.row.get(column, "") for column in (*others, *tuning.space)),
+            *(trial.row.get(column, "") for column in columns),
         ]
         for trial in tuning.trials
     ]
@@ -348,7 +334,5 @@ def tuning_tables(tuning: TuningStudy) -> tuple[Table, Table, Table]:
     return (
         Table(f"{tuning.name} winner", caption, ["key", "winner", "baseline", "importance"], changed),
         Table(f"{tuning.name} finalists", finalists, ["trial", "score", "certified"], tuning.finalists),
-        Table(
-            f"{tuning.name} trials", "All trials", ["trial", "status", "score", *others, *tuning.space], rows
-        ),
+        Table(f"{tuning.name} trials", "All trials", ["trial", "status", "score", *columns], trials),
     )
