@@ -86,19 +86,24 @@ def steps_up_to(bound: float) -> Callable[[float], str]:
 
 def texts(cell: Cell) -> tuple[str, str]:
     """A cell's text, and that of its interval, "" where it has none."""
+    return _written(cell)[:2]
+
+
+def _written(cell: Cell) -> tuple[str, str, dict[str, object]]:
+    """A cell's two texts, and its numbers in a CSV by the ends of their headings."""
     match cell:
-        case str():
-            return cell, ""
         case Share(count, total, low, high):
-            return f"{count} / {total}", f"[{100 * low:.0f} %, {100 * high:.0f} %]"
+            ends = {"": count, " of": total, " low": _digits(low), " high": _digits(high)}
+            return f"{count} / {total}", f"[{100 * low:.0f} %, {100 * high:.0f} %]", ends
         case IntervalCell(Interval(point, low, high), form):
-            return form(point), "" if math.isnan(low) else f"[{form(low)}, {form(high)}]"
-        case int():
-            return f"{cell:,}", ""
+            ends = {"": _digits(point), " low": _digits(low), " high": _digits(high)}
+            return form(point), "" if math.isnan(low) else f"[{form(low)}, {form(high)}]", ends
+        case None:
+            return NOTHING, "", {}
         case float():
-            return number(cell), ""
+            return number(cell), "", {"": _digits(cell)}
         case _:
-            return NOTHING, ""
+            return f"{cell:,}" if isinstance(cell, int) else cell, "", {"": cell}
 
 
 def to_captioned_markdown(table: Table) -> str:
@@ -133,27 +138,12 @@ def _markdown(cell: Cell) -> str:
 
 def to_csv(table: Table) -> str:
     """A CSV of plain numbers; an interval takes three columns, a share four."""
-    rows = [list(map(_csv_parts, row)) for row in table.rows]
-    ends = [list(dict.fromkeys(end for row in rows for end in row[at])) for at in range(len(table.columns))]
-    ends = [each or [""] for each in ends]
-    heads = [head + end for head, own in zip(table.columns, ends, strict=True) for end in own]
-    cells = (
-        [parts.get(end, "") for parts, own in zip(row, ends, strict=True) for end in own] for row in rows
-    )
-    return csv_text([heads, *cells])
-
-
-def _csv_parts(cell: Cell) -> dict[str, object]:
-    """What a cell comes to, by the ends of its columns' headings."""
-    match cell:
-        case IntervalCell(Interval(point, low, high), _):
-            return {"": _digits(point), " low": _digits(low), " high": _digits(high)}
-        case Share(count, total, low, high):
-            return {"": count, " of": total, " low": _digits(low), " high": _digits(high)}
-        case None:
-            return {}
-        case _:
-            return {"": _digits(cell) if isinstance(cell, float) else cell}
+    columns: list[list[object]] = []
+    for at, heading in enumerate(table.columns):
+        parts = [_written(row[at])[2] for row in table.rows]
+        ends = dict.fromkeys(end for each in parts for end in each) or [""]
+        columns += [[heading + end, *(each.get(end, "") for each in parts)] for end in ends]
+    return csv_text(zip(*columns, strict=True))
 
 
 def _digits(value: float) -> str:
