@@ -19,9 +19,9 @@ from gridworld.base.console import printable, telling_if_slow
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import limited
 from gridworld.commands import parser_of, whole
-from gridworld.report.analysis import MOST_SHOWN, Reason, Reasons, gather
+from gridworld.report.analysis import Reason, Reasons, first_ones, gather
 from gridworld.report.grouping import Group
-from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report
+from gridworld.report.writer import FORMATS, MARKERS, around_markers, check_out, write_readme, write_report
 from gridworld.run.folder import check_inside
 from gridworld.training.saved_run import SavedRun
 
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str]) -> None:
     out = options.out or (options.runs[0] / "report" if is_one else Path("runs/report"))
     check_out(out)
     if options.readme is not None:
-        check_markers(options.readme)
+        around_markers(options.readme)
     with telling_if_slow("reading the runs"):
         report = gather(options.runs, options.seed, options.log_steps)
     with telling_if_slow("diagnosing runs that are not certified"):
@@ -49,9 +49,7 @@ def main(arguments: Sequence[str]) -> None:
     if options.readme is not None:
         write_readme(report, options.readme)
     sentences = report.sentences()
-    lines = [f"warning: {printable(sentence)}" for sentence in sentences[:MOST_SHOWN]]
-    if len(sentences) > MOST_SHOWN:
-        lines.append(f"warning: and {len(sentences) - MOST_SHOWN} more, all in the report")
+    lines = [f"warning: {printable(each)}" for each in first_ones(sentences, ", all in the report")]
     lines += [f"note: {printable(note)}" for note in (*report.study.notes, *report.notes)]
     for line in lines:
         print(line, file=sys.stderr)

@@ -24,7 +24,6 @@ from gridworld.world import metrics
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
 
-_HEIGHT = 190.0  # points, of curves
 _NAME = 25  # characters, the width of a name at a row
 _BOOTSTRAP = "interquartile mean (IQM) with 95 % bootstrap bands"
 _MOST_DRAWN = len(chart.COLOURS)  # agents in one figure
@@ -67,10 +66,6 @@ def _curves(analysis: TaskAnalysis, styles: Styles, more: str) -> Iterator[Chart
         )
     bands = {result.group.agent: result.certificates for result in results}
     if any(band.point.any() for band in bands.values()):
-        for result in results:
-            if len(result.group.runs) == 1:  # Wilson's interval for one seed would cover nearly everything
-                band, unknown = result.certificates, np.full(len(result.certificates.steps), math.nan)
-                bands[result.group.agent] = replace(band, low=unknown, high=unknown)
         yield draw(
             f"{task} certified",
             f"Seeds certified optimal on {task}",
@@ -164,7 +159,7 @@ def _draw_curves(
     looks += [{"color": INK, "linestyle": _REFERENCES[mark]} for mark in seen]
     handles = [Line2D([], [], linewidth=2.2, **look) for look in looks]
     legend = list(zip(handles, [*chart.short_names(list(bands), 56), *seen], strict=True))
-    figure, axes = chart.new_figure(title, _HEIGHT, "y", legend)
+    figure, axes = chart.new_figure(title, chart.HEIGHT, "y", legend)
     axes.set(ylim=bounds, ylabel=label)
     axes.yaxis.set_major_formatter(form)
     first = -math.inf

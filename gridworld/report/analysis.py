@@ -16,7 +16,7 @@ from gridworld.base.errors import InputError
 from gridworld.config.train import check_bounds
 from gridworld.config.worlds import schema_of
 from gridworld.report import statistics
-from gridworld.report.evidence import DAMAGED, REPORTED, SAMPLED_RETURN, Evidence, Unusable, find_runs, read
+from gridworld.report.evidence import REPORTED, SAMPLED_RETURN, Evidence, Unusable, find_runs, read
 from gridworld.report.grouping import Group, Study, arrange
 from gridworld.report.playground.page import fits, link
 from gridworld.report.statistics import Interval, Share
@@ -25,8 +25,9 @@ from gridworld.run.provenance import versions
 from gridworld.run.reader import ONLINE, read_run, stored_world
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
+from gridworld.world.metrics import wilson_interval
 
-MOST_SHOWN = 20  # sentences on standard error; the page has them all
+_MOST_SHOWN = 20  # sentences on standard error; the page has them all
 _GRID_POINTS = 101  # from step 0 to the end of the task's longest run
 _MOST_CELLS = 100_000  # beyond, solving the world again would take longer than the report
 _TOLERANCE = 1e-6  # relative
@@ -169,8 +170,9 @@ def _band(runs: Sequence[Evidence], column: str, grid: FloatArray, seed: int) ->
 def _certificates(runs: Sequence[Evidence], grid: FloatArray) -> Band:
     """The share of runs that are certified at each step of the grid, with Wilson's 95 % interval."""
     counts = np.sum([on_grid(run, "certified", grid) for run in runs], axis=0)
-    shares = [statistics.share(int(count), len(runs)) for count in counts]
-    low, high = np.array([(share.low, share.high) for share in shares]).T
+    low, high = np.array([wilson_interval(int(count), len(runs)) for count in counts]).T
+    if len(runs) == 1:  # it would cover nearly everything
+        low = high = np.full(len(grid), math.nan)
     return Band(grid, counts / len(runs), low, high, min(run.steps for run in runs))
 
 
@@ -277,12 +279,18 @@ class Report:
     def damage(self) -> list[str]:
         """A sentence for each damaged file of the runs."""
         counted = [sentence for run in self.runs for sentence in run.damage]
-        return [*counted, *(each for run in self.unusable if run.state == DAMAGED for each in run.reasons)]
+        return [*counted, *(each for run in self.unusable if run.is_damaged for each in run.reasons)]
 
     def sentences(self) -> list[str]:
         """What somebody should look into."""
-        unfinished = [each for run in self.unusable if run.state != DAMAGED for each in run.reasons]
+        unfinished = [each for run in self.unusable if not run.is_damaged for each in run.reasons]
         return [*self.problems, *self.damage, *unfinished, *self.study.warnings]
+
+
+def first_ones(sentences: Sequence[str], rest: str = "") -> list[str]:
+    """As many sentences as are shown, and how many more there are, which ends with `rest`."""
+    count = len(sentences) - _MOST_SHOWN
+    return [*sentences[:_MOST_SHOWN], *([f"and {count} more{rest}"] if count > 0 else [])]
 
 
 def gather(paths: Sequence[Path], seed: int = 0, log_steps: bool = False) -> Report:
@@ -298,28 +306,23 @@ def gather(paths: Sequence[Path], seed: int = 0, log_steps: bool = False) -> Rep
     unusable = tuple(outcome for outcome in outcomes if isinstance(outcome, Unusable))
     if not runs:
         sentences = [*problems, *(reason for run in unusable for reason in run.reasons)]
-        more = f"; and {len(sentences) - MOST_SHOWN} more" if len(sentences) > MOST_SHOWN else ""
-        raise InputError(f"nothing to report: {'; '.join(sentences[:MOST_SHOWN])}{more}")
+        raise InputError(f"nothing to report: {'; '.join(first_ones(sentences))}")
     study = arrange(runs)
-    tasks = tuple(_task(task, study.on(task), seed, log_steps) for task in study.tasks)
+    tasks = tuple(_task(task, study, seed, log_steps) for task in study.tasks)
     tunings, unread = find_tunings(paths)
-    problems += [f"{task.task}: {task.world.problem}" for task in tasks if task.world.problem]
-    problems += unread
-    by_version: dict[str, list[Path]] = defaultdict(list)
-    for run in runs:
-        by_version[run.version].append(run.folder)
-    own = str(versions()["gridworld"])
-    notes = [
-        f"{len(found)} {'runs were' if len(found) > 1 else 'run was'} written by gridworld {version}, "
-        f"this is {own}: {found[0]}{' and others' if len(found) > 1 else ''}."
-        for version, found in sorted(by_version.items())
-        if version != own
-    ]
+    problems += [f"{task.task}: {task.world.problem}" for task in tasks if task.world.problem] + unread
+    own, notes = str(versions()["gridworld"]), []
+    for version in sorted({run.version for run in runs} - {own}):
+        first, *others = (run.folder for run in runs if run.version == version)
+        were = f"{len(others) + 1} runs were" if others else "1 run was"
+        where = f"{first}{' and others' if others else ''}"
+        notes.append(f"{were} written by gridworld {version}, this is {own}: {where}.")
     overall = _overall(tasks, seed)
     return Report(study, tasks, overall, unusable, tuple(problems), tuple(notes), seed, tuple(tunings))
 
 
-def _task(task: str, groups: list[Group], seed: int, log_steps: bool) -> TaskAnalysis:
+def _task(task: str, study: Study, seed: int, log_steps: bool) -> TaskAnalysis:
+    groups = [group for group in study.groups if group.task == task]
     runs = [run for group in groups for run in group.runs]
     world = _reference(next((run for run in runs if not run.damage), runs[0]))
     ends = [max(run.steps for run in group.runs) for group in groups]
@@ -329,8 +332,7 @@ def _task(task: str, groups: list[Group], seed: int, log_steps: bool) -> TaskAna
         log_steps |= bool(known) and max(known) >= _SLOWER * min(known)
     grid = _grid(runs, log_steps)
     results = tuple(_result(group, world, grid, seed) for group in groups)
-    comparisons = _compare([{each.group.agent: each.samples for each in results}], seed)
-    return TaskAnalysis(task, world, results, comparisons, log_steps)
+    return TaskAnalysis(task, world, results, _compare([results], seed), log_steps)
 
 
 def _result(group: Group, world: Reference, grid: FloatArray, seed: int) -> Result:
@@ -355,8 +357,9 @@ def _result(group: Group, world: Reference, grid: FloatArray, seed: int) -> Resu
     )
 
 
-def _compare(tasks: Sequence[Mapping[str, Mapping[str, FloatArray]]], seed: int) -> Comparisons:
-    """Compare agents both ways; `tasks` are {agent: {metric: samples}}, two of which both have, if many."""
+def _compare(results_of_tasks: Sequence[Sequence[Result]], seed: int) -> Comparisons:
+    """Compare agents both ways, where there are several tasks on two that both have."""
+    tasks = [{each.group.agent: each.samples for each in results} for results in results_of_tasks]
     agents = sorted({agent for task in tasks for agent in task})
     found: dict[tuple[str, str, str], Interval] = {}
     compared = [metric for metric in METRICS.values() if metric.is_compared]
@@ -375,11 +378,10 @@ def _compare(tasks: Sequence[Mapping[str, Mapping[str, FloatArray]]], seed: int)
 
 def _overall(tasks: Sequence[TaskAnalysis], seed: int) -> Overall | None:
     """None where no agent was run on two tasks."""
-    samples = [{result.group.agent: result.samples for result in task.results} for task in tasks]
     scores: dict[str, list[FloatArray]] = defaultdict(list)
-    for agent, metrics in itertools.chain.from_iterable(task.items() for task in samples):
-        if len(metrics["optimality"]):
-            scores[agent].append(metrics["optimality"])
+    for result in itertools.chain.from_iterable(task.results for task in tasks):
+        if len(result.samples["optimality"]):
+            scores[result.group.agent].append(result.samples["optimality"])
     strata = {agent: each for agent, each in sorted(scores.items()) if len(each) > 1}
     if not strata:
         return None
@@ -389,4 +391,5 @@ def _overall(tasks: Sequence[TaskAnalysis], seed: int) -> Overall | None:
     lowest = min(float(sample.min()) for each in strata.values() for sample in each)
     levels = np.linspace(min(0.0, max(-1.0, lowest)), 1.0, _LEVELS)
     profiles = {agent: statistics.profile(each, levels, seed) for agent, each in strata.items()}
-    return Overall(len(tasks), optimality, _compare(samples, seed), levels, profiles)
+    comparisons = _compare([task.results for task in tasks], seed)
+    return Overall(len(tasks), optimality, comparisons, levels, profiles)

@@ -33,7 +33,7 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#b8578f", "#c98500", "#3a9bd9", "#8
 _DASHES = ("solid", (0, (6.0, 3.0)), (0, (2.0, 2.5)))
 
 WIDTH = 440.0  # points, of a figure; pixels in the page
-WIDE = 960.0
+WIDE, HEIGHT = 960.0, 190.0  # of a wide figure; of curves
 SMALL, LABEL, HEADING = 11.0, 12.0, 14.0  # points, of fonts
 LINE = 14.5  # points, from one line of a text to the next
 _POINTS = 72  # an inch

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gridworld.base.console import printable
+from gridworld.base.console import plain, printable
 from gridworld.base.errors import InputError
 from gridworld.config.settings import NEWER, flat, privileges
 from gridworld.run.console import scope_of
@@ -26,7 +26,6 @@ from gridworld.world.mdp import FloatArray
 from gridworld.world.metrics import METRICS
 
 MOST_ENTRIES = 2_000_000  # files and folders below a given one: some seconds
-DAMAGED = "damaged"
 SAMPLED_RETURN = "sampled_return"
 
 # The metrics of which a report has the last value, in the order of its tables.
@@ -84,9 +83,8 @@ class Evidence:
 class Unusable:
     """A run that is in no statistic, and why."""
 
-    folder: Path
     reasons: tuple[str, ...]  # a sentence each, which begins with the folder
-    state: str = DAMAGED  # or the status of a run that is not finished
+    is_damaged: bool = True  # or it is not finished
     agent: str | None = None  # None where the manifest does not say
     env: str | None = None
 
@@ -133,20 +131,20 @@ def read(folder: Path) -> Evidence | Unusable:
     try:
         run = read_run(folder)
     except InputError as error:
-        return Unusable(folder, (str(error),))
+        return Unusable((str(error),))
     sections = (run.manifest["config"].get(key) for key in ("agent", "env"))
     agent, env = (section if isinstance(section, dict) else {} for section in sections)
     names = (agent.get("name"), env.get("layout") or env.get("id") or env.get("source"))
-    named = [_printable(name) if isinstance(name, str) else None for name in names]
+    named = [plain_name(name) if isinstance(name, str) else None for name in names]
     if not run.is_finished:
-        return Unusable(folder, (_unfinished(run),), _printable(run.manifest["status"]), *named)
+        return Unusable((_unfinished(run),), False, *named)
     damaged = run.damage()
     try:
         if not damaged.keys() & {CURVE, SUMMARY}:
             return _evidence(run, tuple(damaged.values()))
     except InputError as error:
         damaged = {"": str(error)} | damaged
-    return Unusable(folder, tuple(damaged.values()), DAMAGED, *named)
+    return Unusable(tuple(damaged.values()), True, *named)
 
 
 def _unfinished(run: RunReader) -> str:
@@ -176,8 +174,8 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
     )
     return Evidence(
         folder=run.folder,
-        agent=_printable(summary["agent"]),
-        env=_printable(summary["env"]),
+        agent=plain_name(summary["agent"]),
+        env=plain_name(summary["env"]),
         seed=summary["seed"],
         # Dotted names, and values as JSON.
         settings={
@@ -194,7 +192,7 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
         first_certified_step=first,
         seconds=float(summary["train_seconds"]),
         started=str(manifest.get("started", ""))[:10],
-        version=_printable(str(versions.get("gridworld", "?"))) if isinstance(versions, dict) else "?",
+        version=plain_name(str(versions.get("gridworld", "?"))) if isinstance(versions, dict) else "?",
         curve=_read_curve(run),
         pictures=run.pictures(),
         step_limit=summary.get("max_episode_steps"),
@@ -206,8 +204,9 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
     )
 
 
-def _printable(text: str) -> str:
-    return "".join(sign if sign.isprintable() else "?" for sign in text)[:_LONGEST_NAME]
+def plain_name(text: str) -> str:
+    """A name out of a file, with control characters escaped, and of 80 characters at most."""
+    return plain(text)[:_LONGEST_NAME]
 
 
 def _read_curve(run: RunReader) -> dict[str, FloatArray]:

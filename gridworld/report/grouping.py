@@ -61,10 +61,6 @@ class Study:
         """All that are counted, each with its group."""
         return [(group, run) for group in self.groups for run in group.runs]
 
-    def on(self, task: str) -> list[Group]:
-        """The groups of one task."""
-        return [group for group in self.groups if group.task == task]
-
 
 def arrange(runs: Iterable[Evidence]) -> Study:
     """Sort runs into groups, name the groups, and keep one run per seed."""

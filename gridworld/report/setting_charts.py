@@ -26,7 +26,6 @@ from gridworld.report.tables import estimate
 from gridworld.report.tuning_study import TrialRow, TuningStudy
 from gridworld.world.mdp import FloatArray
 
-_HEIGHT = 190.0  # points
 _LEAST = 3  # configurations that make a sweep, and more of them than settings that differ
 _LINE = 64  # characters of tick labels next to each other
 _NEVER = "#c6c6c6"  # of cells without a finite value: no colour of the ramp
@@ -136,7 +135,7 @@ def _line(sweep: Sweep, metric: str, name: str, title: str, description: str) ->
     is_share = metric == "certified"
     top = 1.0 if is_share else 1.06 * float(ends[np.isfinite(ends)].max()) or 1.0
     points, low, high = np.where(np.isfinite(ends[:, :1]), np.minimum(ends, top), np.nan).T
-    figure, axes = chart.new_figure(title, _HEIGHT, "y")
+    figure, axes = chart.new_figure(title, chart.HEIGHT, "y")
     axes.yaxis.set_major_formatter(chart.percent if is_share else chart.compact)
     axes.set(ylim=(0.0, top), ylabel=_SHOWN[metric][0], xlabel=_short(sweep.keys[0]))
     axes.set(xlim=(-0.4, len(values) - 0.6), xticks=range(len(values)))
@@ -210,7 +209,7 @@ def _history(tuning: TuningStudy) -> Chart:
         "best so far": {"color": _WINNER, "linewidth": 2.2, "clip_on": False},
     }
     legend = [(Line2D([], [], **look), name) for name, look in looks.items()]
-    figure, axes = chart.new_figure("Score by trial", _HEIGHT, "y", legend)
+    figure, axes = chart.new_figure("Score by trial", chart.HEIGHT, "y", legend)
     chart.log_axis(axes, "y", low, high)
     axes.set(ylabel="score, logarithmic", xlim=(0, max(1.0, numbers.max())), xlabel="trial")
     for chosen, look in zip((done, ~done), looks.values(), strict=False):

@@ -26,7 +26,7 @@ from gridworld.base.errors import InputError, reason
 from gridworld.base.safe_read import read_bytes, sha256
 from gridworld.config.train import PICTURES
 from gridworld.report import statistics, tables
-from gridworld.report.analysis import MOST_SHOWN, Band, Report, Result, TaskAnalysis, gather
+from gridworld.report.analysis import Report, Result, first_ones, gather
 from gridworld.report.playground.page import maps_page
 from gridworld.report.tables import to_captioned_markdown, to_csv
 from gridworld.run.folder import EVENTS as EVENT_FILE
@@ -52,7 +52,6 @@ _TAGS = {
 BANDS = {name: (tag, f"over_seeds/{name}_low", f"over_seeds/{name}_high") for name, tag in _TAGS.items()}
 MARKERS = "<!-- results -->", "<!-- /results -->"
 
-_ALL_TASKS = ""  # no task's name
 _MOST_READ_UNASKED = 500  # runs of a sweep: a second
 _OURS = {PAGE, PLAYGROUND, FIGURES, TABLES, EVENTS}
 _LONGEST_NAME = 120
@@ -116,14 +115,14 @@ def _file_names(names: Iterable[str], unsafe: str = r"[^\w.=+-]+", instead: str 
 
 
 def charts(report: Report) -> dict[str, list[Chart]]:
-    """The figures by task, those of tuning studies by title, and over tasks, in the agents' colours."""
+    """The figures by task, those of tuning studies by title, and those over tasks by ""."""
     from gridworld.report.agent_charts import overall_charts, task_charts
     from gridworld.report.setting_charts import tuning_charts
 
     look = _look(report)
     drawn = {task.task: list(task_charts(task, look)) for task in report.tasks}
     drawn |= {tuning.title: list(tuning_charts(tuning)) for tuning in report.tunings}
-    return drawn | {_ALL_TASKS: list(overall_charts(report.overall, look)) if report.overall else []}
+    return drawn | {"": list(overall_charts(report.overall, look)) if report.overall else []}
 
 
 def _look(report: Report) -> Styles:
@@ -167,7 +166,6 @@ def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
         study=report.study,
         headline=next(of_one_study, ""),
         drawn=drawn,
-        overall_figures=drawn[_ALL_TASKS],
         resamples=statistics.RESAMPLES,
         colours={agent: look["color"] for agent, look in _look(report).items()},
         tables=tables,
@@ -217,10 +215,8 @@ def write_over_seeds(runs: Path, folder: Path) -> Path | None:
         return None
     try:
         report = gather([runs])
-        for sentence in report.damage[:MOST_SHOWN]:
+        for sentence in first_ones(report.damage, f" damaged files in {runs}; the report lists all"):
             tell(sentence)
-        if len(report.damage) > MOST_SHOWN:
-            tell(f"{runs}: {len(report.damage) - MOST_SHOWN} more files are damaged; the report lists all")
         if all(len(group.runs) < 2 for group in report.study.groups):
             return None
         with replacing_folder(folder / OVER_SEEDS) as new:
@@ -241,7 +237,12 @@ def _write_events(report: Report, folder: Path) -> None:
     for of_result, (task, result) in zip(folders, results, strict=True):
         of_result.mkdir(parents=True)
         events = EventWriter(of_result, is_first=True)
-        curves = _curves(result, task)
+        regret, best = result.regret, task.world.optimal_value
+        # The value is the optimum's minus the regret: its upper end belongs to the regret's lower one.
+        point, low, high = (best - each for each in (regret.point, regret.high, regret.low))
+        value = dataclasses.replace(regret, point=point, low=low, high=high)
+        curves = {"regret": regret, "value": value, "certified": result.certificates}
+        curves |= {} if result.online is None else {"online_return": result.online}
         events.bands("over seeds, with 95 % intervals", {name: BANDS[name] for name in curves})
         for name, band in curves.items():
             columns = (band.steps, band.point, band.low, band.high)
@@ -251,34 +252,20 @@ def _write_events(report: Report, folder: Path) -> None:
         events.close()
 
 
-def _curves(result: Result, task: TaskAnalysis) -> dict[str, Band]:
-    """The curves by name."""
-    regret, best = result.regret, task.world.optimal_value
-    # The value is the optimum's minus the regret: its upper end belongs to the regret's lower one.
-    point, low, high = (best - each for each in (regret.point, regret.high, regret.low))
-    value = dataclasses.replace(regret, point=point, low=low, high=high)
-    curves = {"regret": regret, "value": value, "certified": result.certificates}
-    return curves if result.online is None else curves | {"online_return": result.online}
-
-
 # ---- a README ------------------------------------------------------------------------------------------
 
 
-def check_markers(path: Path) -> None:
-    """Raise `InputError` unless the Markdown file has the two markers, in order, and can be replaced."""
-    _around_markers(path)
-    check_writable(path.parent, "--readme")
-
-
 def write_readme(report: Report, path: Path) -> None:
-    """Put the tables of results between the two markers of a Markdown file; see `check_markers`."""
-    before, after = _around_markers(path)
+    """Put the tables of results between the two markers of a Markdown file."""
+    before, after = around_markers(path)
     certified = tables.to_coloured_markdown(tables.answer_table(report.study, report.tasks))
     details = tables.to_markdown(tables.results_table(report.tasks, report.reasons))
     write_text(path, f"{before}{MARKERS[0]}\n{certified}\n{details}{MARKERS[1]}{after}")
 
 
-def _around_markers(path: Path) -> tuple[str, str]:
+def around_markers(path: Path) -> tuple[str, str]:
+    """The text before and after a Markdown file's markers; `InputError` where it lacks them, or is fixed."""
+    check_writable(path.parent, "--readme")
     if not path.is_file():
         raise InputError(f"--readme {path}: no such file")
     try:

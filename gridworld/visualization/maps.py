@@ -79,8 +79,8 @@ def policy(subject: Subject) -> Draw:
         name, numbers, scale = "Q", snapshot.q, linear(VIRIDIS, snapshot.q[states[known[states]]])
     table = StateTable(mdp, states, mdp.action_names, legend_rows=2)
     table.paint(numbers, scale, known)
-    picture = _finish_policy_table(table, states, name, scale, snapshot.greedy, optimal, known, caption)
-    return lambda cell_size: picture.frame()
+    _finish_policy_table(table, name, scale, snapshot.greedy, optimal, known, caption)
+    return lambda cell_size: table.frame()
 
 
 def learning(subject: Subject) -> Draw:
@@ -105,7 +105,8 @@ def learning(subject: Subject) -> Draw:
         np.put_along_axis(numbers, greedy[:, None].astype(np.intp), values[:, None], axis=1)
         table = StateTable(mdp, states, mdp.action_names, legend_rows=2, opaque=True)
         table.paint(numbers, scale, known, written=False)
-        return _finish_policy_table(table, states, "value", scale, greedy, optimal, known, caption)
+        _finish_policy_table(table, "value", scale, greedy, optimal, known, caption)
+        return table
 
     frames = (sheet(moment).packed() for moment in moments)
     animation = animation_of_frames(frames, [PAPER, *scale.ramp.tolist()])
@@ -243,24 +244,22 @@ def draw_optimal_actions(canvas: Canvas, optimal: BoolArray) -> None:
 
 def _finish_policy_table(
     table: StateTable,
-    states: IntArray,
     name: str,
     scale: Scale,
     greedy: IntArray,
     optimal: BoolArray,
     known: BoolArray,
     caption: str,
-) -> Sheet:
+) -> None:
     """Frame the greedy action of each state, and add caption and legend."""
-    for row, state in enumerate(states.tolist()):
+    for row, state in enumerate(table.states.tolist()):
         action = int(greedy[state])
         table.mark(row, action, AGENT if optimal[state, action] else DISAGREES)
     table.caption(caption)
     swatches = [Swatch("greedy action", frame=AGENT, thick=2)]
     swatches.append(Swatch("greedy, not optimal", frame=DISAGREES, thick=2))
-    swatches += [] if known[states].all() else [NEVER_VISITED]
+    swatches += [] if known[table.states].all() else [NEVER_VISITED]
     table.legend(scale, name, swatches)
-    return table
 
 
 def value_error(snapshot: PolicySnapshot, best: Solution) -> FloatArray:

@@ -152,7 +152,10 @@ def to_mlflow(run: ExportedRun, out: Path, project: str) -> str:
     key = (there or [client.create_run(experiment, run_name=run.name, tags=tags)])[0].info.run_id
     curve = [*run.curve, (run.evidence.steps, {**run.curve[-1][1], **run.summary})]
     numbers = [Metric(name, float(each), 0, step) for step, row in curve for name, each in row.items()]
-    settings = [Param(name, _text(value)) for name, value in run.settings.items()]
+    settings = [
+        Param(name, (value if isinstance(value, str) else json.dumps(value))[:_LONGEST_PARAM])
+        for name, value in run.settings.items()
+    ]
     status = "FAILED"
     try:
         for kind, all_of_it in (("metrics", numbers), ("params", settings)):
@@ -164,10 +167,6 @@ def to_mlflow(run: ExportedRun, out: Path, project: str) -> str:
     finally:
         client.set_terminated(key, status)
     return uri
-
-
-def _text(value: Any) -> str:
-    return (value if isinstance(value, str) else json.dumps(value))[:_LONGEST_PARAM]
 
 
 def to_hub(run: ExportedRun, out: Path, project: str) -> str:

@@ -27,6 +27,7 @@ from gridworld.config.compose import compose
 from gridworld.config.recipe_file import literal
 from gridworld.config.words import conf_folder, refuse_unclear
 from gridworld.config.worlds import MapConfig, each_once
+from gridworld.report.evidence import plain_name
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.training.saved_run import SavedRun, read_visits
 from gridworld.visualization.picture import Moment, PolicyHistory
@@ -37,7 +38,6 @@ from gridworld.world.mdp import IntArray, Mdp
 _MODULES = ("world", "solver", "learners", "view", "show", "app")  # in the order of their imports
 _IMPORT = re.compile(r'^import \{[^}]*\} from "\./\w+\.js";\n', re.MULTILINE)
 _MOST_STATES, _MOST_SIDE, _MOST_OUTCOMES = 2500, 60, 100_000  # the first two are in world.js too
-_LONGEST_NAME = 80
 _DIGITS = 6  # of values in a run's history, which has them as float32
 _SETTINGS = ("slip", "step_reward", "goal_reward", "trap_reward")
 GAMMA = 0.99
@@ -100,7 +100,7 @@ def run_page(saved: SavedRun) -> str:
     for each in damage:
         tell(f"{each}; the page is without it")
     data["run"] = {
-        "title": f"{_name(config.agent.name)} on {_name(mdp.name)}, seed {config.seed}, {steps:,} steps",
+        "title": f"{plain_name(config.agent.name)} on {data['title']}, seed {config.seed}, {steps:,} steps",
         "agent": config.agent.name,
         "gamma": config.evaluation.gamma,
         "agent_gamma": float(getattr(config.agent, "gamma", config.evaluation.gamma)),
@@ -138,7 +138,7 @@ def _world(mdp: Mdp, gamma: float, step_limit: int) -> dict[str, Any]:
             f"{mdp.name}: is too large for the playground, which shows at most {_MOST_STATES:,} states, in "
             f"maps of at most {_MOST_SIDE} rows and columns, with {_MOST_OUTCOMES:,} outcomes of all actions"
         )
-    data: dict[str, Any] = {"shipped": shipped(), "title": _name(mdp.name), "gamma": gamma}
+    data: dict[str, Any] = {"shipped": shipped(), "title": plain_name(mdp.name), "gamma": gamma}
     if address := link(mdp, gamma, step_limit):
         return data | {"link": address}
     arrays = {
@@ -154,8 +154,8 @@ def _world(mdp: Mdp, gamma: float, step_limit: int) -> dict[str, Any]:
             **{key: np.ravel(array).tolist() for key, array in arrays.items()},
             **{key: mask.astype(int).tolist() for key, mask in masks.items()},
             **dict(zip("nAK", mdp.next_state.shape, strict=True)),
-            "actions": [_name(name) for name in mdp.action_names],
-            "names": [_name(mdp.state_name(state)) for state in range(mdp.num_states)],
+            "actions": [plain_name(name) for name in mdp.action_names],
+            "names": [plain_name(mdp.state_name(state)) for state in range(mdp.num_states)],
             "limit": step_limit,
         }
     }
@@ -211,7 +211,3 @@ def _page(data: dict[str, Any]) -> str:
     text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     head, body, middle, end = re.split(r"/\* [\w.]+ \*/", template)
     return "".join((head, style, body, text, middle, script, end))
-
-
-def _name(text: str) -> str:
-    return plain(text)[:_LONGEST_NAME]
