@@ -93,9 +93,7 @@ def difference(first: Share, second: Share) -> Interval:
     )
 
 
-def bands(
-    statistic: Statistic, samples: Sequence[FloatArray], seed: int, resamples: int = RESAMPLES
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def bands(statistic: Statistic, samples: Sequence[FloatArray], seed: int) -> tuple[FloatArray, ...]:
     """A statistic of samples (..., n), one for each stratum, with its 95 % bootstrap interval at each point.
 
     Returns point, low and high, (...) each; low and high are NaN where a stratum has one run. Points with the
@@ -112,14 +110,13 @@ def bands(
         samples = [sample.reshape(-1, sample.shape[-1])[first] for sample in samples]
         rng, batch = np.random.default_rng(seed), max(1, _LARGEST_BATCH // joined.size)
         parts = []
-        for begin in range(0, resamples, batch):
-            draws = [rng.integers(0, size, (min(batch, resamples - begin), size)) for size in sizes]
+        for begin in range(0, RESAMPLES, batch):
+            draws = [rng.integers(0, size, (min(batch, RESAMPLES - begin), size)) for size in sizes]
             parts.append(statistic(*(sample[..., draw] for sample, draw in zip(samples, draws, strict=True))))
         bounds = np.quantile(np.concatenate(parts, axis=-1), _BOUNDS, axis=-1)
         bounds = bounds[:, place.reshape(point.shape)]
     found = np.stack([point, *bounds])
-    point, low, high = np.where(np.abs(found) > INFINITE, np.copysign(math.inf, found), found)
-    return point, low, high
+    return tuple(np.where(np.abs(found) > INFINITE, np.copysign(math.inf, found), found))
 
 
 def interval(statistic: Statistic, samples: Sequence[FloatArray], seed: int) -> Interval:

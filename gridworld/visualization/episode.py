@@ -65,7 +65,7 @@ def film(
         )
     elif isinstance(env, GymnasiumConfig):
         try:
-            frames = rendered_frames(env, mdp, [each.states.tolist() for each in episodes])
+            frames = rendered_frames(env, mdp, episodes)
         except InputError as error:
             _log.warning("the episode is drawn from the tables, not by its environment: %s", error)
         else:
@@ -114,33 +114,21 @@ def _move(mdp: Mdp, way: list[int], name: str, state: int, following: int) -> st
     return f"moves {name} into a wall" if is_wall else f"moves {name}, but stays"  # slips, or falls back
 
 
-def rendered_frames(
-    env: GymnasiumConfig, mdp: Mdp, walks: Sequence[Sequence[int]], most_pixels: int = _MOST_PIXELS
-) -> list[Frame]:
-    """The environment's own frames (height, width, 3), RGB, of walks: the states of episodes from a start on.
+def rendered_frames(env: GymnasiumConfig, mdp: Mdp, episodes: Sequence[Episode]) -> list[Frame]:
+    """The environment's own frames (height, width, 3), RGB, of whole episodes.
 
-    An environment with a transition table is put into each state. Others are enumerated: from a reset on, the
-    actions that lead through the states are taken.
+    An environment with a transition table is put into each state. In others the episode's actions are taken.
     """
     frames = []
     with _off_screen(), closing(RealEnv(env, mdp)) as real:
-        for states in walks:
-            real.reset(states[0])
-            frames.append(real.frame(most_pixels))
-            for before, state in pairwise(states):
-                real.follow(state, None if real.has_table else _leading(mdp, before, state))
-                frames.append(real.frame(most_pixels))
+        for episode in episodes:
+            first, *states = episode.states.tolist()
+            real.reset(first)
+            frames.append(real.frame())
+            for state, action in zip(states, episode.actions.tolist(), strict=True):
+                real.follow(state, None if real.has_table else action)
+                frames.append(real.frame())
     return frames
-
-
-def _leading(mdp: Mdp, before: int, state: int) -> int:
-    """The action that leads from one state to another."""
-    leading = np.flatnonzero(mdp.next_state[before, :, 0] == state)
-    if not leading.size:
-        raise InputError(
-            f"{mdp.name}: no action leads from {mdp.state_name(before)} to {mdp.state_name(state)}"
-        )
-    return int(leading[0])
 
 
 class RealEnv:
@@ -175,14 +163,14 @@ class RealEnv:
         with self._rendering():
             self._env.step(action)
 
-    def frame(self, most_pixels: int = _MOST_PIXELS) -> Frame:
+    def frame(self) -> Frame:
         """Its picture (height, width, 3), RGB, scaled down where it has more pixels."""
         with self._rendering():
             frame = np.asarray(self._env.render(), dtype=np.uint8)
             height, width = frame.shape[:2]
-        if height * width <= most_pixels:
+        if height * width <= _MOST_PIXELS:
             return frame.copy()
-        scale = (most_pixels / (height * width)) ** 0.5
+        scale = (_MOST_PIXELS / (height * width)) ** 0.5
         size = max(1, int(width * scale)), max(1, int(height * scale))
         return np.asarray(Image.fromarray(frame).resize(size, Image.Resampling.BOX))
 
