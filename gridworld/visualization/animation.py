@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gridworld.base.bounds import positive_int
 from gridworld.base.errors import InputError
 from gridworld.envs import rendering as drawing
 from gridworld.envs.rendering import Frame, Packed
@@ -50,18 +49,11 @@ class Animation:
         return self.draw(self.keys[0]).size
 
 
-def automatic_cell_size(mdp: Mdp, cell_size: int | None = None) -> int:
-    """The cell size in pixels: as given, or 100, less where the frame would be far above 1000."""
-    if cell_size is None:
-        return drawing.fitting_cell_size(mdp, _LONGEST_SIDE)
-    return positive_int("cell_size", cell_size)
-
-
 def animation_of_states(
     mdp: Mdp, states: IntArray, cell_size: int | None = None, captions: Sequence[Caption] = ()
 ) -> Animation:
     """Show the agent in one state (pictures,) after the other, with captions in the lower border."""
-    size = automatic_cell_size(mdp, cell_size)
+    size = cell_size or drawing.fitting_cell_size(mdp, _LONGEST_SIDE)
     empty, palette, encoded = _empty_board(mdp, size)
     if sum(map(len, encoded.values())) > _MOST_ENCODED:
         encoded.clear()
@@ -98,7 +90,7 @@ def animation_of_cards(
     mdp: Mdp, states: IntArray, cell_size: int | None = None, captions: Sequence[Caption] = ()
 ) -> Animation:
     """Show states (pictures,) in text: their names, and captions below these."""
-    frame_size = drawing.frame_size(mdp, automatic_cell_size(mdp, cell_size))
+    frame_size = drawing.frame_size(mdp, cell_size or drawing.fitting_cell_size(mdp, _LONGEST_SIDE))
     names = map(mdp.state_name, states.tolist())
     cards = [(name, *caption) for name, caption in zip(names, captions, strict=True)]
     greys = np.repeat(np.arange(_MOST_COLOURS, dtype=np.uint8)[:, None], 3, axis=1)
@@ -131,12 +123,9 @@ def animation_of_frames(frames: Iterable[Frame | Packed], likely: Iterable[Seque
 
 
 def animation_of_rendered(
-    frames: Sequence[Frame],
-    keys: Sequence[int],
-    longest_side: int | None = None,
-    captions: Sequence[Caption] = (),
+    frames: Sequence[Frame], longest_side: int | None = None, captions: Sequence[Caption] = ()
 ) -> Animation:
-    """Show the frame of each key, scaled down to `longest_side` pixels, and quantised, where necessary.
+    """Show RGB frames one after the other, scaled down to `longest_side` pixels, and quantised, if necessary.
 
     Captions, one a frame, are written below them where there is room for them.
     """
@@ -153,12 +142,12 @@ def animation_of_rendered(
             pictures[index] = np.concatenate([pictures[index], drawing.surface_to_frame(below)])
     if (numbered := _number(pictures)) is not None:
         numbers, palette = numbered
-        return Animation(keys, lambda key: _image(numbers[key], palette))
+        return Animation(range(len(numbers)), lambda key: _image(numbers[key], palette))
     every = 1 + sum(picture.size for picture in pictures) // _SAMPLED
     sample = np.concatenate([picture.reshape(-1, 3)[::every] for picture in pictures])[None]
     common = Image.fromarray(np.ascontiguousarray(sample)).quantize(_MOST_COLOURS)
     images = [Image.fromarray(each).quantize(palette=common, dither=Image.Dither.NONE) for each in pictures]
-    return Animation(keys, lambda key: images[key].copy())
+    return Animation(range(len(images)), lambda key: images[key].copy())
 
 
 def _scaled_down(frame: Frame, longest_side: int | None) -> Frame:

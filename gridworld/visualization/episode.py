@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from gridworld.base.console import printable, tell
+from gridworld.base.console import tell
 from gridworld.base.errors import InputError, in_short
 from gridworld.config.worlds import EnvConfig, GymnasiumConfig
 from gridworld.envs.rendering import Frame, Kind, board_of, frame_size, import_pygame
@@ -60,9 +60,7 @@ def film(
     """
     captions = [lines for episode in episodes for lines in _captions(mdp, episode, max_episode_steps)]
     if isinstance(env, GymnasiumConfig) and not is_trusted:
-        tell(
-            printable(f"the episode is drawn from the run's tables; {env.id} itself is only drawn with trust")
-        )
+        tell(f"the episode is drawn from the run's tables; {env.id} itself is only drawn with trust")
     elif isinstance(env, GymnasiumConfig):
         try:
             frames = rendered_frames(env, mdp, episodes)
@@ -70,10 +68,7 @@ def film(
             _log.warning("the episode is drawn from the tables, not by its environment: %s", error)
         else:
             return lambda cell_size: animation_of_rendered(
-                frames,
-                range(len(frames)),
-                None if cell_size is None else max(frame_size(mdp, cell_size)),
-                captions,
+                frames, None if cell_size is None else max(frame_size(mdp, cell_size)), captions
             )
     states = np.concatenate([each.states for each in episodes])
     show = animation_of_states if board_of(mdp).panels else animation_of_cards

@@ -27,8 +27,8 @@ _LAST_FRAME_HOLD = 4  # frames; the last one is shown for so many more before th
 _LONGEST_GIF_FRAME = 0xFFFF  # hundredths of a second
 
 
-def save(drawn: Frame | Animation, path: Path, fps: int) -> bytes | None:
-    """Write a picture as its path's ending says, or numbered PNGs; returns the content of a GIF."""
+def save(drawn: Frame | Animation, path: Path, fps: int) -> None:
+    """Write a picture as its path's ending says, or numbered PNGs."""
     if not isinstance(drawn, Animation):
         write_bytes(path, encode_png(drawn))
     elif not path.suffix:
@@ -36,10 +36,7 @@ def save(drawn: Frame | Animation, path: Path, fps: int) -> bytes | None:
     elif path.suffix == ".mp4":
         _save_mp4(drawn, path, fps)
     else:
-        content = encode_gif(drawn, fps) if path.suffix == ".gif" else encode_apng(drawn, fps)
-        write_bytes(path, content)
-        return content
-    return None
+        write_bytes(path, encode_gif(drawn, fps) if path.suffix == ".gif" else encode_apng(drawn, fps))
 
 
 def encode_png(pixels: NDArray[np.uint8], palette: bytes = b"") -> bytes:

@@ -282,8 +282,8 @@ def test_an_episode_shows_the_frames_of_the_environment(monkeypatch: pytest.Monk
 
 
 def test_foreign_frames_of_few_colours_stay_exact() -> None:
-    frames = [np.full((4, 6, 3), colour, dtype=np.uint8) for colour in (AGENT, TRAP)]
-    shown = animation_of_rendered(frames, [1, 0, 1])
+    frames = [np.full((4, 6, 3), colour, dtype=np.uint8) for colour in (TRAP, AGENT, TRAP)]
+    shown = animation_of_rendered(frames)
     colours = [tuple(np.asarray(shown.draw(key).convert("RGB"))[0, 0]) for key in shown.keys]
     assert colours == [TRAP, AGENT, TRAP]
 

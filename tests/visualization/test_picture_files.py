@@ -14,7 +14,7 @@ from gridworld.base.atomic_write import replacing, replacing_folder, write_json
 from gridworld.base.errors import InputError, failure
 from gridworld.envs.rendering import draw_frame, pack
 from gridworld.visualization import files
-from gridworld.visualization.animation import animation_of_frames, animation_of_states, automatic_cell_size
+from gridworld.visualization.animation import animation_of_frames, animation_of_states
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 
@@ -107,8 +107,8 @@ def test_films_that_memory_or_a_player_could_not_hold_are_refused(monkeypatch: p
     long = animation_of_states(CLASSIC, np.tile(WALK, 5), 500)
     with pytest.raises(InputError, match="apng: 50 pictures of 4000 x 3500 pixels are too many"):
         files.check_size(long, ["apng"])
-    assert automatic_cell_size(CLASSIC) == 100
-    assert automatic_cell_size(compile_mdp(parse("S" + "." * 98 + "G", "wide"))) == 9
+    assert animation_of_states(CLASSIC, WALK).size == (800, 700)
+    assert animation_of_states(compile_mdp(parse("S" + "." * 98 + "G", "wide")), WALK[:1]).size == (918, 27)
     monkeypatch.setattr(files, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install -e '.*\[video\]'"):
         files.require_video()
