@@ -189,12 +189,6 @@ class Result:
     certificates: Band
     online: Band | None  # None unless all runs have it
 
-    @property
-    def shortest_uncertified(self) -> float:
-        """Steps that every run which is not certified in the end was at least given."""
-        ends = [run.steps for run in self.group.runs if not run.certified]
-        return float(min(ends, default=0))
-
 
 # By metric and two agents: the probability that a run of the first is better than one of the second.
 Comparisons = Mapping[tuple[str, str, str], Interval]

@@ -6,6 +6,7 @@ of colour vision can distinguish; from the eighth agent on, lines are dashed.
 
 from __future__ import annotations
 
+import functools
 import io
 import itertools
 import textwrap
@@ -189,20 +190,15 @@ def clipped(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[:half]}…{text[-half:]}"
 
 
-def wrapped(text: str, most: int) -> str:
-    """Escape control characters, and break into at most six lines of `most` characters."""
-    lines = textwrap.wrap(
-        plain(text)[:1000], most, break_on_hyphens=False, max_lines=_MOST_LINES, placeholder=" …"
-    )
-    return "\n".join(lines)
-
-
 def short_names(names: Sequence[str], most: int) -> list[str]:
-    """Labels in lines of `most` characters; of one agent's configurations without its name."""
+    """Labels in at most six lines of `most` characters; of one agent's configurations without its name."""
     parts = [name.removesuffix(")").partition(" (") for name in names]
     is_one_agent = len(names) > 1 and len({head for head, _, _ in parts}) == 1
     shown = [tail for _, _, tail in parts] if is_one_agent and all(map(all, parts)) else names
-    return [wrapped(name, most) for name in shown]
+    wrap = functools.partial(
+        textwrap.wrap, width=most, break_on_hyphens=False, max_lines=_MOST_LINES, placeholder=" …"
+    )
+    return ["\n".join(wrap(plain(name)[:1000])) for name in shown]
 
 
 def seed_counts(counts: Sequence[int]) -> str:

@@ -9,14 +9,13 @@ import dataclasses
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from gridworld.base.console import plain
 from gridworld.base.safe_read import csv_text
-from gridworld.report.analysis import METRICS, Comparisons, Overall, Reasons, Report, Result, TaskAnalysis
-from gridworld.report.evidence import Unusable
-from gridworld.report.grouping import Study, differing, learning_key
+from gridworld.report.analysis import METRICS, Comparisons, Overall, Report, Result, TaskAnalysis
+from gridworld.report.grouping import differing, learning_key
 from gridworld.report.statistics import Interval, Share
 from gridworld.report.tuning_study import TuningStudy
 
@@ -152,15 +151,11 @@ def _digits(value: float) -> str:
 
 def all_tables(report: Report) -> Iterator[Table]:
     """Those that are written as files."""
-    study = report.study
-    yield results_table(report.tasks, report.reasons)
-    yield answer_table(study, report.tasks)
-    yield steps_table(study, report.tasks)
-    yield runs_table(study)
-    yield unusable_table(report.unusable)
+    for table in (results_table, answer_table, steps_table, runs_table, unusable_table):
+        yield table(report)
     if report.reasons:
-        yield reasons_table(study, report.reasons)
-    yield settings_table(study)
+        yield reasons_table(report)
+    yield settings_table(report)
     for task in report.tasks:
         yield task_table(task)
         yield scores_table(task)
@@ -171,13 +166,14 @@ def all_tables(report: Report) -> Iterator[Table]:
         yield from tuning_tables(tuning)
 
 
-def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
-    """The main results on all tasks; also the table for a README. `reasons` are of runs not certified."""
+def results_table(report: Report) -> Table:
+    """The main results on all tasks; also the table for a README."""
     shown = [("regret", "iqm"), ("steps", "median"), ("first", "median")]
     columns = ["task", "agent", "seeds certified", "ever certified", *(_HEADINGS[which] for which in shown)]
-    results, rows = [result for task in tasks for result in task.results], list[list[Cell]]()
+    results, rows = [result for task in report.tasks for result in task.results], list[list[Cell]]()
     for result in results:
-        causes = Counter(reasons[run.folder].cause for run in result.group.runs if run.folder in reasons)
+        reasons = (report.reasons.get(run.folder) for run in result.group.runs)
+        causes = Counter(reason.cause for reason in reasons if reason is not None)
         most = [f"{cause} ({count} of {causes.total()})" for cause, count in causes.most_common(1)]
         rows.append([result.group.task, result.group.agent, result.certified, result.ever])
         rows[-1] += [*(estimate(result, *which) for which in shown), "".join(most)]
@@ -219,7 +215,8 @@ def _table_of(
 def estimate(result: Result, key: str, statistic: str) -> IntervalCell | None:
     """A statistic of a metric as a cell; None where no run has the metric."""
     found = result.estimates.get((key, statistic))
-    form = steps_up_to(result.shortest_uncertified) if key in ("steps", "first") else number
+    given = min((run.steps for run in result.group.runs if not run.certified), default=0)
+    form = steps_up_to(given) if key in ("steps", "first") else number
     return None if found is None else IntervalCell(found, form)
 
 
@@ -242,28 +239,28 @@ def overall_table(overall: Overall) -> Table:
     return Table("all tasks", "Optimality over tasks", ["agent", "tasks", "optimality, IQM"], rows)
 
 
-def answer_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
+def answer_table(report: Report) -> Table:
     """Seeds certified at the end, agents down and tasks across."""
-    cells = {(each.group.agent, task.task): each.certified for task in tasks for each in task.results}
-    return _grid("certified", "Seeds certified optimal at the end", study, cells)
+    return _grid("certified", "Seeds certified optimal at the end", report, lambda result: result.certified)
 
 
-def steps_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
+def steps_table(report: Report) -> Table:
     """The median steps until certified for good, agents down and tasks across."""
-    results = [(task.task, result) for task in tasks for result in task.results]
-    cells = {(each.group.agent, task): each.estimates["steps", "median"].point for task, each in results}
-    return _grid("steps", "Steps until certified for good, median", study, cells)
+    caption = "Steps until certified for good, median"
+    return _grid("steps", caption, report, lambda result: result.estimates["steps", "median"].point)
 
 
-def _grid(name: str, caption: str, study: Study, cells: Mapping[tuple[str, str], Cell]) -> Table:
-    rows = [[agent, *(cells.get((agent, task)) for task in study.tasks)] for agent in study.agents]
-    return Table(name, caption, ["agent", *study.tasks], rows)
+def _grid(name: str, caption: str, report: Report, of: Callable[[Result], Cell]) -> Table:
+    cells = {(each.group.agent, task.task): of(each) for task in report.tasks for each in task.results}
+    agents, tasks = report.study.agents, report.study.tasks
+    rows = [[agent, *(cells.get((agent, task)) for task in tasks)] for agent in agents]
+    return Table(name, caption, ["agent", *tasks], rows)
 
 
-def runs_table(study: Study) -> Table:
+def runs_table(report: Report) -> Table:
     """A row for each run that is counted."""
     rows: list[list[Cell]] = []
-    for group, run in study.runs:
+    for group, run in report.study.runs:
         certified, steps = (
             "yes" if run.certified else "no",
             (run.certified_since_step, run.first_certified_step),
@@ -276,30 +273,31 @@ def runs_table(study: Study) -> Table:
     return Table("runs", "All runs that are counted", [*columns, "folder"], rows)
 
 
-def reasons_table(study: Study, reasons: Reasons) -> Table:
+def reasons_table(report: Report) -> Table:
     """A row for each run whose reason is known."""
     rows: list[list[Cell]] = [
         [group.agent, group.task, run.seed, run.regret, reason.cause, reason.change]
-        for group, run in study.runs
-        if (reason := reasons.get(run.folder)) is not None
+        for group, run in report.study.runs
+        if (reason := report.reasons.get(run.folder)) is not None
     ]
-    missing = sum(not run.certified for _, run in study.runs) - len(rows)
+    missing = sum(not run.certified for run in report.runs) - len(rows)
     rest = f"; {missing} more were not diagnosed, see --diagnose" if missing else ""
     columns = ["agent", "task", "seed", "regret", "largest cause", "to try"]
     return Table("not certified", f"Why runs are not certified{rest}", columns, rows)
 
 
-def unusable_table(unusable: Sequence[Unusable]) -> Table:
+def unusable_table(report: Report) -> Table:
     """A row for each run that is not counted."""
-    rows = [[run.agent or NOTHING, run.env or NOTHING, "; ".join(run.reasons)] for run in unusable]
+    rows = [[run.agent or NOTHING, run.env or NOTHING, "; ".join(run.reasons)] for run in report.unusable]
     return Table("not counted", "Runs that are not counted", ["agent", "task", "reason"], rows)
 
 
-def settings_table(study: Study) -> Table:
+def settings_table(report: Report) -> Table:
     """Settings in which the groups differ."""
-    settings = [dict(learning_key(group.runs[0])) for group in study.groups]
+    groups = report.study.groups
+    settings = [dict(learning_key(group.runs[0])) for group in groups]
     rows = [[name, *(each.get(name, "") for each in settings)] for name in differing(settings)]
-    columns = ["setting", *(f"{group.agent} on {group.task}" for group in study.groups)]
+    columns = ["setting", *(f"{group.agent} on {group.task}" for group in groups)]
     return Table("settings", "Settings in which agents differ", columns, rows)
 
 

@@ -258,8 +258,8 @@ def _write_events(report: Report, folder: Path) -> None:
 def write_readme(report: Report, path: Path) -> None:
     """Put the tables of results between the two markers of a Markdown file."""
     before, after = around_markers(path)
-    certified = tables.to_coloured_markdown(tables.answer_table(report.study, report.tasks))
-    details = tables.to_markdown(tables.results_table(report.tasks, report.reasons))
+    certified = tables.to_coloured_markdown(tables.answer_table(report))
+    details = tables.to_markdown(tables.results_table(report))
     write_text(path, f"{before}{MARKERS[0]}\n{certified}\n{details}{MARKERS[1]}{after}")
 
 
