@@ -55,6 +55,9 @@ class Share:
         """Whether it is all of them."""
         return self.count == self.total
 
+    def __str__(self) -> str:
+        return f"{self.count} of {self.total} [{100 * self.low:.0f} %, {100 * self.high:.0f} %]"
+
 
 Statistic = Callable[..., FloatArray]  # of all samples (..., n) together, along the last axis
 

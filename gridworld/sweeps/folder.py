@@ -102,12 +102,11 @@ class SweepFolder:
         with alone_in(self.path, wait=1):
             yield
 
-    def add(self, jobs: Sequence[Job], words: Sequence[str]) -> list[JobEntry]:
-        """Write to sweep.json what is asked for by the overrides `words`."""
+    def add(self, jobs: Sequence[Job], words: Sequence[str]) -> list[Job]:
+        """Write to sweep.json what is asked for by the overrides `words`; returns the jobs with folders."""
         taken = {entry.job.lower() for entry in self.entries.values()}
-        # Also the folders of no job.
-        taken |= {file.parent.name.lower() for file in self.path.glob(f"*/{MANIFEST}")}
-        taken |= {path.name.lower() for path in self.path.iterdir() if path.is_symlink()}
+        others = (each for each in self.path.iterdir() if each.is_symlink() or (each / MANIFEST).exists())
+        taken |= {each.name.lower() for each in others}  # of no job
         lines = [e.overrides for e in self.entries.values()] + [job.overrides for job in jobs]
         common = set(lines[0]).intersection(*lines)
         for job in jobs:
@@ -122,7 +121,8 @@ class SweepFolder:
         jobs_json = [dataclasses.asdict(entry) for entry in self.entries.values()]
         content = {"asked": self._asked, "versions": versions(), "jobs": jobs_json}
         write_json(self.path / SWEEP_JSON, sealed(content), durable=True)
-        return [self.entries[job.hash] for job in jobs]
+        here = self.path.absolute()
+        return [dataclasses.replace(job, folder=here / self.entries[job.hash].job) for job in jobs]
 
     def rows(
         self, reasons: Mapping[str, str] = _NONE, ended: Mapping[str, JobRow] = _NONE
@@ -145,8 +145,8 @@ class SweepFolder:
         write_text(self.path / JOBS_CSV, csv_text([head, *map(dataclasses.astuple, rows.values())]))
 
     def _load(self, file: Path) -> None:
+        content = read_sealed(file)
         try:
-            content = read_sealed(file)
             self._asked = list(content["asked"])
             _ = self._asked[-1], [_words(earlier["overrides"]) for earlier in self._asked]
             for item in content["jobs"]:
@@ -157,11 +157,9 @@ class SweepFolder:
             names = {entry.job.lower() for entry in self.entries.values()}
             if not len(content["jobs"]) == len(self.entries) == len(names):
                 raise ValueError("two jobs have the same folder or hash")
-        except (ValueError, LookupError, TypeError, AttributeError) as error:  # an `InputError` is one
-            what = str(error) if isinstance(error, ValueError) else "a part is missing"
-            what = what.removeprefix(f"{file}: ")
+        except (ValueError, LookupError, TypeError, AttributeError) as error:
             raise InputError(
-                f"{file}: damaged ({what}); restore a good copy, or choose another hydra.sweep.dir"
+                f"{file}: damaged ({error}); restore a good copy, or choose another hydra.sweep.dir"
             ) from None
 
 
@@ -186,7 +184,9 @@ def job_row(folder: Path, entry: JobEntry | None = None) -> JobRow:
         if status in (PENDING, INTERRUPTED) and is_locked(folder / LOCK):
             return dataclasses.replace(row, status=RUNNING)
         if run is None:
-            error = _first_line(folder / ERROR_FILE)
+            file = folder / ERROR_FILE
+            text = read_bytes(file, LARGEST_JSON).decode(errors="replace") if file.exists() else ""
+            error = one_line(text.partition("\n")[0])
             return dataclasses.replace(row, status=FAILED if error else PENDING, error=error)
         if status == DONE and entry is not None and (other := _other_job(run.manifest, entry)):
             return dataclasses.replace(row, status=FAILED, error=other)
@@ -217,12 +217,6 @@ def _other_job(manifest: dict[str, Any], entry: JobEntry) -> str:
         lengths = []
     what = f"was made {lengths[-1]} steps long" if lengths else "has different settings from the job"
     return f"the run in {entry.job} {what}, so it is not this job's result; move it to keep it"
-
-
-def _first_line(file: Path) -> str:
-    if not file.exists():
-        return ""
-    return one_line(read_bytes(file, LARGEST_JSON).decode(errors="replace").partition("\n")[0])
 
 
 def one_line(text: Any) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 import os
 import signal
 import sys
@@ -23,9 +22,9 @@ from gridworld.base.errors import FolderLostError, InputError, MachineError, rea
 from gridworld.base.signals import Interrupted, exiting, handling, send_sigterm
 from gridworld.base.together import mixing
 from gridworld.base.user_input import called_from
-from gridworld.config.train import AUTO, TrainConfig
+from gridworld.config.train import AUTO
 from gridworld.run.folder import ERROR_FILE, LOCK, MANIFEST
-from gridworld.run.reader import find_run, is_started
+from gridworld.run.reader import find_run, is_started, read_run
 from gridworld.run.writer import clear, record_failure
 from gridworld.sweeps.folder import one_line
 from gridworld.sweeps.plan import Job
@@ -37,40 +36,34 @@ _Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _UNFINISHED = ("running", "interrupted")  # statuses of runs that were stopped from outside
 
 
-class JobError(Exception):
-    """The job failed, or could not go on; its folder says which."""
-
-
-def run_in_sweep(
-    config: TrainConfig, folder: Path, overrides: list[str], replaces: bool = False
-) -> Training[float]:
+def run_in_sweep(job: Job) -> Training[None]:
     """Train in the job's folder, unless that is done or another process does it.
 
-    An interrupted run goes on from its checkpoint; a failed one is replaced.
+    An interrupted run goes on from its checkpoint; a failed one is replaced. Raises why the job failed, which
+    its folder has too, or could not go on.
     """
+    folder, config = job.folder, job.config
+    quiet = replace(config, logging=replace(config.logging, progress=False))  # the sweep has its own line
     try:
         with locked(folder / LOCK, wait=1) as is_ours:
-            if not is_ours or ((status := run_status(folder)) == "finished" and not replaces):
-                return math.nan
+            if not is_ours or ((status := run_status(folder)) == "finished" and not job.replaces):
+                return
             if status not in _UNFINISHED:
                 (folder / MANIFEST).unlink(missing_ok=True)
                 clear(folder)
-            # The sweep has a progress line of its own.
-            quiet = replace(config, logging=replace(config.logging, progress=False))
-            is_begun = is_started(folder)
-            run = (
-                unfinished_of(folder, quiet).resumption() if is_begun else training(quiet, folder, overrides)
-            )
-            return float((yield from run)["regret"])
+            if is_started(folder):
+                yield from unfinished_of(folder, quiet).resumption()
+            else:
+                yield from training(quiet, folder, list(job.overrides))
     except Interrupted as interruption:
         sys.exit(interruption.exit_code)
-    except (OSError, MachineError, FolderLostError) as error:  # the job itself is right, and goes on later
-        raise JobError(one_line(reason(error))) from None
+    except (OSError, MachineError, FolderLostError):
+        raise  # the job itself is right, and goes on later
     except Exception as error:
-        why = one_line(reason(error))
+        trace = "" if isinstance(error, InputError) else traceback.format_exc()
         with contextlib.suppress(OSError):
-            mark_failed(folder, why, "" if isinstance(error, InputError) else traceback.format_exc())
-        raise JobError(why) from None
+            mark_failed(folder, one_line(reason(error)), trace)
+        raise
 
 
 def run_status(folder: Path) -> str:
@@ -84,12 +77,10 @@ def run_status(folder: Path) -> str:
 
 def mark_failed(folder: Path, why: str, trace: str = "") -> None:
     """Note why the job failed, unless its run did: in the manifest, or where there is none in a file."""
-    run = None
-    with contextlib.suppress(InputError):  # a damaged manifest is left as it is
-        run = find_run(folder)
-        if run is not None and run.manifest["status"] in _UNFINISHED:
-            record_failure(run, why)
-    if run is None:
+    status = run_status(folder)
+    if status in _UNFINISHED:
+        record_failure(read_run(folder), why)
+    elif not status:
         write_text(folder / ERROR_FILE, f"{why}\n{trace}")
 
 
@@ -126,13 +117,13 @@ class Worker:
             pass
         return errors
 
-    def _run(self, job: Job) -> Training[float]:
+    def _run(self, job: Job) -> Training[None]:
         subfolder = self.master.hydra.output_subdir
         job.folder.mkdir(parents=True, exist_ok=True)
         if subfolder is not None:
             _save(job, job.folder / subfolder)
         with called_from(Path(self.where)):
-            return (yield from run_in_sweep(job.config, job.folder, list(job.overrides), job.replaces))
+            yield from run_in_sweep(job)
 
 
 def _save(job: Job, folder: Path) -> None:

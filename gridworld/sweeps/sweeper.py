@@ -8,9 +8,9 @@ import os
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from hydra.types import HydraContext
 from omegaconf import DictConfig, open_dict, read_write
@@ -43,7 +43,6 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
     if master.hydra.job.chdir:
         raise InputError("hydra.job.chdir=true: is for a single run; the jobs of a sweep train together")
     most = largest_population(settings.population)
-    divide = partial(populations, most=most, launcher=launcher, own=own)
     words = [*_of_yaml(settings), *words]  # a word of the command line comes later, and counts
     loader = context.config_loader
     jobs = plan(expand(words, loader, settings.max_jobs, settings.paired), Configurations(loader, master))
@@ -60,8 +59,7 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
             with read_write(master.hydra.runtime), open_dict(master.hydra.runtime):
                 master.hydra.runtime.output_dir = str(here)  # for `hydra.job_logging`
             worker = Worker(here, os.getcwd(), master)
-            sweep = _Sweep(folder, jobs, words, worker, partial(run_groups, launcher=launcher, own=own))
-            code = sweep.run(divide, settings.retry_failed)
+            code = _Sweep(folder, jobs, words, worker, launcher, own).run(most, settings.retry_failed)
     except ConnectionError:
         raise  # from a cluster, not from a disk
     except OSError as error:
@@ -92,19 +90,20 @@ class _Sweep:
         jobs: Sequence[Job],
         words: Sequence[str],
         worker: Worker,
-        run_groups: Callable[[Launch], None],
+        launcher: str,
+        own: Mapping[str, Any],
     ) -> None:
-        self._folder, self._jobs, self._worker, self._run_groups = folder, jobs, worker, run_groups
-        self._names = {entry.hash: entry.job for entry in folder.add(jobs, words)}
+        self._folder, self._jobs, self._worker = folder, folder.add(jobs, words), worker
+        self._launcher, self._own = launcher, own  # and its settings
         # Why jobs do not go on, as far as their folders do not say it: a full disk, a mistake.
-        self._reasons = {self._names[job.hash]: job.mistake for job in jobs if job.mistake}
-        self._rows: dict[str, JobRow] = {}
+        self._reasons = {job.folder.name: job.mistake for job in self._jobs if job.mistake}
+        self._rows: dict[str, JobRow] = {}  # by the names of their folders
         self._line = ProgressLine(any(job.config.logging.progress for job in jobs))
         self._started = self._due = time.monotonic()
         self._ended_before = 0
 
-    def run(self, divide: Callable[[Sequence[Job]], list[list[Job]]], retry_failed: bool) -> int:
-        """Run the jobs to do, and print how they ended; returns the exit code."""
+    def run(self, most: int | None, retry_failed: bool) -> int:
+        """Run the jobs to do, at most so many as one, and print how they ended; returns the exit code."""
         for name, mistake in self._reasons.items():
             folder = inside(self._folder.path, name)
             if not run_status(folder):
@@ -119,7 +118,8 @@ class _Sweep:
         received: list[int] = []  # signals; Ray may change the exception that one raises
         try:
             with exiting(signal.SIGINT, signal.SIGTERM, first=received.append):
-                if to_do and (lost := self._launch(divide(to_do))):
+                groups = populations(to_do, most, self._launcher, self._own)
+                if groups and (lost := self._launch(groups)):
                     self._run_lost([job for job in to_do if job.hash in lost])
         except SystemExit as end:
             code = 128 + received[0] if received else end.code if isinstance(end.code, int) else 1
@@ -129,7 +129,7 @@ class _Sweep:
         self._look()
         rows = [self._row(job) for job in self._jobs]
         seconds = time.monotonic() - self._started
-        mistaken = [self._names[job.hash] for job in self._jobs if job.mistake]
+        mistaken = [job.folder.name for job in self._jobs if job.mistake]
         console.tell_end(self._folder.path, rows, seconds, stopped, mistaken)
         return code or int(any(row.status != DONE for row in rows))
 
@@ -140,8 +140,7 @@ class _Sweep:
         self._look()
         for job in jobs:
             if job.hash in lost and self._row(job).status in (PENDING, INTERRUPTED):
-                folder = self._folder.path / self._names[job.hash]
-                mark_failed(folder, f"its process died ({lost[job.hash]})")
+                mark_failed(job.folder, f"its process died ({lost[job.hash]})")
 
     def _launch(self, groups: Sequence[Sequence[Job]]) -> dict[str, str]:
         """Run populations; returns why a process was lost, by the hashes of its jobs."""
@@ -154,17 +153,15 @@ class _Sweep:
             for job, error in zip(jobs, errors, strict=False):  # there are fewer where it was told to stop
                 self._reasons[job.folder.name] = error
 
-        folder = self._folder.path.absolute()
-        found = [[self._begun(job, folder) for job in group] for group in groups]
-        self._run_groups(Launch(self._worker, found, ended, self._tick))
+        def begun(job: Job) -> Job:
+            return dataclasses.replace(job, replaces=self._rows.pop(job.folder.name).status == FAILED)
+
+        found = [list(map(begun, group)) for group in groups]
+        run_groups(Launch(self._worker, found, ended, self._tick), self._launcher, self._own)
         return lost
 
-    def _begun(self, job: Job, folder: Path) -> Job:
-        row = self._rows.pop(self._names[job.hash])
-        return dataclasses.replace(job, folder=folder / row.job, replaces=row.status == FAILED)
-
     def _row(self, job: Job) -> JobRow:
-        return self._rows[self._names[job.hash]]
+        return self._rows[job.folder.name]
 
     def _look(self) -> None:
         """Write the table once workers that lost their sweep have ended, if they do soon."""

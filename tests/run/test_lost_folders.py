@@ -14,7 +14,8 @@ from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.folder import alone_in
 from gridworld.run.reader import open_run
 from gridworld.sweeps.folder import SweepFolder
-from gridworld.sweeps.job import JobError, run_in_sweep
+from gridworld.sweeps.job import run_in_sweep
+from gridworld.sweeps.plan import Job
 from gridworld.training.pictures import Pictures
 from gridworld.training.together import run_alone
 
@@ -55,8 +56,8 @@ def test_a_run_that_lost_its_folder_leaves_the_new_one_alone(
     monkeypatch.setattr(owner, name, then_taken_over)
     folder.mkdir()
     if is_job:
-        with SweepFolder(tmp_path).at_work(), pytest.raises(JobError, match=TOLD):
-            run_alone(run_in_sweep(configure(*WORDS), folder, WORDS))
+        with SweepFolder(tmp_path).at_work(), pytest.raises(FolderLostError, match=TOLD):
+            run_alone(run_in_sweep(Job(tuple(WORDS), (), "0" * 32, None, configure(*WORDS), folder=folder)))
     else:
         with pytest.raises(FolderLostError, match=TOLD), alone_in(folder):
             begin(folder, *WORDS)

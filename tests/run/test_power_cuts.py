@@ -97,14 +97,13 @@ def run_sweep(folder: Path) -> None:
     sweep = SweepFolder(folder)
     sweep.check(jobs, extend=False)
     with sweep.at_work():
-        entries = sweep.add(jobs, ["seed=0,1"])
+        jobs = sweep.add(jobs, ["seed=0,1"])
         rows = sweep.rows()
         assert {row.status for row in rows.values()}.isdisjoint({FAILED})
-        for entry in entries:
-            if rows[entry.job].status != DONE:
-                (folder / entry.job).mkdir(exist_ok=True)
-                config, words = configure(*entry.overrides), list(entry.overrides)
-                run_alone(run_in_sweep(config, folder / entry.job, words, False))
+        for job in jobs:
+            if rows[job.folder.name].status != DONE:
+                job.folder.mkdir(exist_ok=True)
+                run_alone(run_in_sweep(job))
         sweep.write(sweep.rows())
 
 

@@ -55,7 +55,8 @@ def test_a_link_below_is_not_gone_through(names: tuple[str, ...], tmp_path: Path
 def test_confirming_takes_no_folder_away_through_a_link(link: str, tmp_path: Path, victim: Path) -> None:
     link_to(victim, tmp_path / "study" / link)
     before = contents(victim)
-    run = confirm.HeldOutRun(tmp_path / "study" / "confirm" / "default,00000000,seed=3", configure(), [])
+    place = tmp_path / "study" / "confirm" / "default,00000000,seed=3"
+    run = Job((), (), "0" * 32, None, configure(), folder=place)
     with pytest.raises(InputError, match=REFUSED):
         confirm.prepare(tmp_path / "study", [run])
     with pytest.raises(InputError, match=REFUSED):
@@ -94,7 +95,7 @@ def test_a_sweep_with_a_job_that_leads_elsewhere_is_refused(link: str, tmp_path:
         SweepFolder(sweep).check(jobs, extend=False)
     (sweep / "seed=1").symlink_to(victim)  # no job of the sweep's has it, and none gets it
     folder = SweepFolder(sweep)
-    assert [entry.job for entry in folder.add(jobs[1:], ["seed=1"])] != ["seed=1"]
+    assert [job.folder.name for job in folder.add(jobs[1:], ["seed=1"])] != ["seed=1"]
     assert contents(victim) == before
 
 

@@ -23,18 +23,19 @@ from optuna.trial import FrozenTrial, TrialState
 
 from gridworld.base.atomic_write import check_no_links, inside, remove_path
 from gridworld.base.console import tell
-from gridworld.base.errors import InputError
+from gridworld.base.errors import InputError, reason
 from gridworld.base.processes import LostError, Processes
 from gridworld.config.train import TrainConfig
 from gridworld.report import statistics
 from gridworld.report.tables import number, steps_up_to
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import find_run
-from gridworld.sweeps.folder import FAILED, job_row
-from gridworld.sweeps.job import JobError, run_in_sweep
+from gridworld.sweeps.folder import FAILED, job_row, one_line
+from gridworld.sweeps.job import run_in_sweep
+from gridworld.sweeps.plan import Job
 from gridworld.sweeps.tune.objective import FINAL, SEEDS, Outcome, SeedScore, Trials, read_score, score
 from gridworld.sweeps.tune.study_spec import StudySpec
-from gridworld.training.together import Training, run_together
+from gridworld.training.together import run_together
 from gridworld.world.mdp import FloatArray
 
 CONFIRM = "confirm"  # the folder of the winner's runs, in the study's
@@ -110,49 +111,34 @@ def _name(trial: FrozenTrial, seed: int) -> str:
     return f"{FINAL}trial={trial.number},seed={seed}"
 
 
-@dataclass(frozen=True)
-class HeldOutRun:
-    """A run on a seed that no trial has seen."""
-
-    folder: Path
-    config: TrainConfig
-    words: list[str]  # of a command line that gives these settings
-
-
-def run_held_out(runs: Sequence[HeldOutRun]) -> None:
-    """Train such runs, together where they can; what came of them is in their folders."""
-    for result in run_together([_training(run) for run in runs]):
+def run_held_out(runs: Sequence[Job]) -> None:
+    """Train held-out runs, together where they can; what came of them is in their folders."""
+    for run in runs:
+        inside(run.folder.parents[1], CONFIRM, run.folder.name).mkdir(parents=True, exist_ok=True)
+    for run, result in zip(runs, run_together([run_in_sweep(run) for run in runs]), strict=True):
         if isinstance(result, Exception):
-            raise result
-
-
-def _training(run: HeldOutRun) -> Training[None]:
-    inside(run.folder.parents[1], CONFIRM, run.folder.name).mkdir(parents=True, exist_ok=True)
-    try:
-        yield from run_in_sweep(run.config, run.folder, run.words)
-    except JobError as error:
-        tell(f"{run.folder}: {error}")
+            tell(f"{run.folder}: {one_line(reason(result))}")
 
 
 def held_out_runs(
     folder: Path, name: str, config: TrainConfig, seeds: Sequence[int], words: Sequence[str]
-) -> list[HeldOutRun]:
+) -> list[Job]:
     """A run of a configuration on each seed; only the first ones write event files.
 
     A run's folder has a hash of its settings in its name: other settings are other runs.
     """
-    world, runs = config.env.compile().text(), list[HeldOutRun]()
+    world, runs = config.env.compile().text(), list[Job]()
     silent = dataclasses.replace(config.logging, tensorboard=False)
     for seed in seeds:
         logging = config.logging if len(runs) < _IN_TENSORBOARD else silent
         of_seed = dataclasses.replace(config, seed=seed, logging=logging)
-        digest = settings_hash(dataclasses.asdict(of_seed), world)[:_HASH_SHOWN]
-        place = folder / CONFIRM / f"{name},{digest},seed={seed}"
-        runs.append(HeldOutRun(place, of_seed, [*words, f"seed={seed}"]))
+        digest = settings_hash(dataclasses.asdict(of_seed), world)
+        place = folder / CONFIRM / f"{name},{digest[:_HASH_SHOWN]},seed={seed}"
+        runs.append(Job((*words, f"seed={seed}"), (), digest, None, of_seed, folder=place))
     return runs
 
 
-def prepare(folder: Path, runs: Sequence[HeldOutRun]) -> None:
+def prepare(folder: Path, runs: Sequence[Job]) -> None:
     """Make the runs' folder in the study's, and remove damaged runs and those of an earlier winner."""
     there = inside(folder, CONFIRM)
     there.mkdir(parents=True, exist_ok=True)
@@ -207,11 +193,9 @@ class HeldOutResults:
     def text(self) -> str:
         """The share certified, and the median step, with their intervals, in a few words."""
         median, form = statistics.interval(statistics.median, [self.steps], 0), steps_up_to(self.total)
-        share = self.certified
         text = (
-            f"certified on {share.count} of {share.total} [{100 * share.low:.0f} %, {100 * share.high:.0f} "
-            f"%], for good from step {form(median.point)} [{form(median.low)}, {form(median.high)}] in the "
-            "median"
+            f"certified on {self.certified}, for good from step {form(median.point)} [{form(median.low)}, "
+            f"{form(median.high)}] in the median"
         )
         notes = []
         if self.failed:
@@ -229,7 +213,7 @@ class HeldOutResults:
         return {"certified": dataclasses.asdict(self.certified), **own}
 
 
-def read_results(runs: Sequence[HeldOutRun]) -> HeldOutResults:
+def read_results(runs: Sequence[Job]) -> HeldOutResults:
     """Read what runs of one configuration came to; one that failed was not certified."""
     steps, failed, left_out = [], [], []
     for run in runs:

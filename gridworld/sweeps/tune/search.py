@@ -66,11 +66,6 @@ class SearchError(Exception):
     """A search that had begun came to nothing, or cannot be continued; in one sentence."""
 
 
-def study_url(spec: StudySpec) -> str:
-    """Where the study's database is."""
-    return spec.settings.storage or f"sqlite:///{spec.folder.absolute() / 'study.db'}"
-
-
 def _shown(url: str) -> str:
     """The URL without its password."""
     return f"tune.storage={make_url(url).render_as_string(hide_password=True)}"

@@ -44,11 +44,10 @@ from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.report.writer import write_over_seeds
 from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, check_writable, claimed, shell_path, shown
 from gridworld.run.provenance import versions
-from gridworld.sweeps.plan import may_fork
+from gridworld.sweeps.plan import Job, may_fork
 from gridworld.sweeps.tune.confirmation import (
     CONFIRM,
     Finalist,
-    HeldOutRun,
     choose_finalists,
     held_out_runs,
     prepare,
@@ -58,7 +57,7 @@ from gridworld.sweeps.tune.confirmation import (
     verdict_on,
 )
 from gridworld.sweeps.tune.objective import ERROR, with_values
-from gridworld.sweeps.tune.search import SearchError, in_reach, open_study, search, study_url
+from gridworld.sweeps.tune.search import SearchError, in_reach, open_study, search
 from gridworld.sweeps.tune.study_spec import StudySpec
 from gridworld.training.setup import import_for
 from gridworld.training.tensorboard import hparams
@@ -80,10 +79,9 @@ def tune(spec: StudySpec) -> None:
 
 
 def _tune(spec: StudySpec) -> None:
-    url, about = study_url(spec), _about(spec)
-    is_begun = is_claimed(spec.folder, spec.name)
-    study = open_study(url, spec.name, about, spec.space, must_exist=is_begun)
-    claim(spec.folder, spec.name, about)
+    url, about = spec.settings.storage or f"sqlite:///{spec.folder.absolute() / 'study.db'}", _about(spec)
+    study = open_study(url, spec.name, about, spec.space, must_exist=is_claimed(spec.folder, spec.name))
+    write_json(spec.folder / SEARCH_JSON, sealed({"study": spec.name, "about": about}), durable=True)
     workers = Processes(spec.settings.workers, can_fork() and may_fork(spec.base), attempts=4)
     if workers.forks:
         import_for(spec.base)  # once for all of them
@@ -169,9 +167,7 @@ def _tuned(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
     return dataclasses.replace(tuned, agent=agent)
 
 
-def _confirm(
-    spec: StudySpec, winner: list[HeldOutRun], began_from: list[HeldOutRun], workers: Processes
-) -> dict[str, Any]:
+def _confirm(spec: StudySpec, winner: list[Job], began_from: list[Job], workers: Processes) -> dict[str, Any]:
     """Run both and compare them; an empty `winner` is for settings that the search began from."""
     runs = [run for pair in itertools.zip_longest(began_from, winner) for run in pair if run is not None]
     count = len(began_from)
@@ -210,11 +206,6 @@ def is_claimed(folder: Path, name: str) -> bool:
             f"{folder}: is the folder of the study {owner}; choose another tune.folder, or tune.study={owner}"
         )
     return True
-
-
-def claim(folder: Path, name: str, about: Mapping[str, Any]) -> None:
-    """Write that the folder is this study's."""
-    write_json(folder / SEARCH_JSON, sealed({"study": name, "about": about}), durable=True)
 
 
 def write_study(spec: StudySpec, study: optuna.Study, outcome: dict[str, Any]) -> None:
