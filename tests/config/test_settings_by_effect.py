@@ -126,7 +126,7 @@ def answers(config: TrainConfig) -> dict[str, Any]:
 
 def is_searched(key: str) -> bool:
     try:
-        SearchSpace({key: DimensionConfig("categorical", choices=[1, 2])}, "own")
+        SearchSpace({key: DimensionConfig("categorical", choices=[1, 2])})
     except InputError:
         return False
     return True

@@ -179,20 +179,20 @@ def test_the_recipe_of_a_study_in_any_world_is_of_that_world(
 def test_choices_that_need_each_other_are_no_mistake() -> None:
     base = configure("agent=ppo")  # 128 environments, so that a rollout is 128 times n_steps
     batch = {"agent.batch_size": DimensionConfig("categorical", choices=[384, 1024])}
-    with pytest.raises(InputError, match=r"tune=own: agent\.batch_size=384"):
-        SearchSpace(batch, "own").check(base, check_settings(base))
+    with pytest.raises(InputError, match=r"^agent\.batch_size=384"):
+        SearchSpace(batch).check(base, check_settings(base))
     rollout = {"agent.n_steps": DimensionConfig("categorical", choices=[3, 16])}
-    SearchSpace(batch | rollout, "own").check(base, check_settings(base))
+    SearchSpace(batch | rollout).check(base, check_settings(base))
 
 
 def test_lists_and_arguments_of_a_class_can_be_searched() -> None:
     nets = DimensionConfig("categorical", choices=[[64], [64, 64]])
-    space = SearchSpace({"agent.policy_kwargs.net_arch": nets}, "own")
+    space = SearchSpace({"agent.policy_kwargs.net_arch": nets})
     base = configure("agent=ppo")
     space.check(base, check_settings(base))
     values = space.values(optuna.create_study().ask(space.distributions).params)
     assert with_values(base, values).agent.policy_kwargs.net_arch in nets.choices  # type: ignore[attr-defined, operator]
-    space = SearchSpace({"agent.arguments.gae_lambda": DimensionConfig("float", low=0.5, high=1)}, "own")
+    space = SearchSpace({"agent.arguments.gae_lambda": DimensionConfig("float", low=0.5, high=1)})
     config = with_values(configure("agent=a2c"), space.values({"agent.arguments.gae_lambda": 0.123456}))
     assert config.agent.arguments["gae_lambda"] == 0.5  # type: ignore[attr-defined]  # never below the range
 
@@ -212,7 +212,7 @@ def test_lists_and_arguments_of_a_class_can_be_searched() -> None:
 def test_what_is_off_the_grid_is_outside(
     key: str, dimension: DimensionConfig, value: float, is_inside: bool
 ) -> None:
-    space = SearchSpace({key: dimension}, "own")
+    space = SearchSpace({key: dimension})
     found = space.parameters_of(configure("agent=q_learning", f"{key}={value}"))
     assert found == ({key: value} if is_inside else None)
 
@@ -551,8 +551,7 @@ TWO = SearchSpace(
     {
         "agent.gamma": DimensionConfig(type="categorical", choices=[0.9, 0.99]),
         "agent.learning_rate": DimensionConfig(type="float", low=0.1, high=0.9),
-    },
-    "two",
+    }
 )
 
 

@@ -37,7 +37,7 @@ from gridworld.base.signals import handling
 from gridworld.config.compose import to_config
 from gridworld.config.messages import sentence
 from gridworld.config.train import TrainConfig
-from gridworld.training.learning_curve import LearningCurve
+from gridworld.training.learning_curve import Evaluation, LearningCurve
 from gridworld.training.setup import check_settings, make_context
 from gridworld.training.together import Training, run_together
 from gridworld.world.evaluation import Evaluator
@@ -168,9 +168,8 @@ class _Trial:
         self.seeds = seeds
         self._objective, self._name, self._values, self._ask = objective, name, values, ask
         self._standings: list[list[SeedScore]] = [[] for _ in seeds]  # at each report that is due
-        self._results: list[SeedScore | Exception | None] = [None for _ in seeds]
-        self._ended: list[SeedScore] = []  # seeds that are reported to their end
-        self._reported = 0  # points of the next one
+        self._results: dict[int, SeedScore | Exception] = {}  # by the seed's place
+        self._reports = self._report()
 
     def training(self, place: int) -> Training[None]:
         """Train the seed at this place, unless the trial ends without it."""
@@ -184,7 +183,7 @@ class _Trial:
             pass
         except Exception as error:
             self._results[place] = error
-            self._report()
+            next(self._reports, None)
 
     def _check(self) -> None:
         if self.outcome is not None:
@@ -194,36 +193,35 @@ class _Trial:
         """Note a seed's score after a share of its budget, also at points skipped, so that all have all."""
         due = min(math.floor(share * self._objective.reports + 1e-9), self._objective.reports)
         self._standings[place] += [standing] * (due - len(self._standings[place]))
-        self._report()
+        next(self._reports, None)
         self._check()
 
-    def _report(self) -> None:
-        """Report what is due, the seeds in order, as far as they have come."""
-        reports, of = self._objective.reports, len(self.seeds)
+    def _report(self) -> Iterator[None]:
+        """Report the seeds in order, and set the outcome; yields where the next report is not due yet."""
+        reports, of, ended = self._objective.reports, len(self.seeds), list[SeedScore]()
         total = self._objective.base.total_timesteps
-        while self.outcome is None and len(self._ended) < of:
-            place, point = len(self._ended), self._reported
-            standings, result = self._standings[place], self._results[place]
-            if point < len(standings):
-                self._reported += 1
+        for place, standings in enumerate(self._standings):
+            point = 0
+            while point < len(standings) or place not in self._results:
+                if point == len(standings):
+                    yield
+                    continue
                 standing, step = standings[point], place * reports + point
-                value = score([*self._ended, standing], total, of)
+                value = score([*ended, standing], total, of)
                 is_skipped = any(standing is later for later in standings[point + 1 :])
                 is_behind = self._ask(Report(self._name, step, value, not is_skipped))
                 if is_behind and step + 1 < of * reports:
-                    self.outcome = Outcome(seeds=self._ended)
-            elif isinstance(result, Exception):
-                self.outcome = Outcome(None, reason(result), self._ended)
-            elif result is None:
+                    self.outcome = Outcome(seeds=ended)
+                    return
+                point += 1
+            result = self._results[place]
+            if isinstance(result, Exception):
+                self.outcome = Outcome(None, reason(result), ended)
                 return
-            else:
-                self._ended.append(result)
-                self._reported = 0
-        if self.outcome is None:
-            value = score(self._ended, total, of)
-            is_number = not math.isnan(value)
-            error = "" if is_number else "the objective is NaN"
-            self.outcome = Outcome(value if is_number else None, error, self._ended)
+            ended.append(result)
+        value = score(ended, total, of)
+        failed = Outcome(None, "the objective is NaN", ended)
+        self.outcome = failed if math.isnan(value) else Outcome(value, "", ended)
 
 
 def learning(
@@ -238,22 +236,18 @@ def learning(
     context = make_context(config, mdp)
     agent = config.agent.build(context)
     curve = LearningCurve(evaluator, agent, config, envs=context.envs)
-    steps = 0
+    steps, total = 0, config.total_timesteps
 
-    def standing() -> SeedScore:
-        assert curve.newest is not None
-        return SeedScore(config.seed, curve.certificate.certified_since_step, curve.newest.greedy.regret)
+    def standing(evaluation: Evaluation) -> SeedScore:
+        return SeedScore(seed, curve.certificate.certified_since_step, evaluation.greedy.regret)
 
     def on_step(done: int) -> int:
         nonlocal steps
         steps = done
-        before = curve.newest
-        next_call = curve.on_step(done)
-        if curve.newest is not None and curve.newest is not before:
-            on_evaluation(curve.newest.step / config.total_timesteps, standing())
-        return next_call
+        return curve.on_step(done)
 
     curve.evaluate(0)
-    yield Learning(agent, config.total_timesteps, on_step)
-    curve.evaluate(steps)
-    return standing()
+    curve.sinks.append(lambda evaluation: on_evaluation(evaluation.step / total, standing(evaluation)))
+    yield Learning(agent, total, on_step)
+    curve.sinks.clear()  # the last evaluation is the result
+    return standing(curve.evaluate(steps))

@@ -1,17 +1,8 @@
 """What a study's command line asks for: the configuration to begin from, and how to search.
 
 There are two compositions. What does not begin with `tune` is composed as by train.py, so that a search
-begins from the very configuration that train.py runs; the rest is composed with conf/tune.yaml.
-
-The search space has for each key of the configuration, or argument of the agent's class, the values to choose
-from:
-
-    agent.learning_rate: {type: float, low: 1e-4, high: 3e-2, log: true}
-    agent.n_epochs: {type: int, low: 2, high: 10}
-    agent.policy_kwargs.net_arch: {type: categorical, choices: [[64], [64, 64]]}
-
-Before anything runs, both ends of a range and every choice of a list are put into the configuration, which
-is checked as a run's would be.
+begins from the very configuration that train.py runs; the rest is composed with conf/tune.yaml. The search
+space has a range or a list for each key of the configuration, or argument of the agent's class.
 """
 
 from __future__ import annotations
@@ -38,7 +29,7 @@ from yaml import YAMLError
 
 from gridworld.base.console import program
 from gridworld.base.errors import InputError
-from gridworld.base.processes import core_count
+from gridworld.base.processes import worker_count
 from gridworld.config.compose import (
     compose_run,
     compose_whole,
@@ -71,22 +62,14 @@ _TRIALS_AT_ONCE = 8  # over all workers; the sampler knows nothing of those that
 class StudySpec:
     """What a command line asks for."""
 
+    name: str  # the study's
+    folder: Path  # the study's
     conf: tuple[Path, ...]  # the user's own folders of yaml files, which are searched after `conf/`
     base: TrainConfig  # the configuration that the search begins from
     choices: dict[str, str]  # of CHOSEN
     words: list[str]  # of a command line that gives the base, but for the seed
     settings: TuneConfig  # without null where a default follows from the rest
     space: SearchSpace
-
-    @property
-    def name(self) -> str:
-        """The study's name."""
-        return str(self.settings.study)
-
-    @property
-    def folder(self) -> Path:
-        """The study's folder."""
-        return Path(str(self.settings.folder))
 
     @property
     def objective(self) -> Objective:
@@ -123,16 +106,20 @@ def compose_study(words: Sequence[str], conf: tuple[Path, ...] = ()) -> StudySpe
         if not any(re.match(r"[+~]*tune(?!\.)", word) for word in of_search):
             of_search.append(f"tune={choices['agent']}")
         search = compose_whole("tune", [*of_search, *search_path(conf)])
-        space_name = str(search.hydra.runtime.choices["tune"])
         settings = cast(TuneConfig, OmegaConf.to_object(search.tune))
     except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
         raise InputError(sentence(error)) from None
     settings = _completed(settings, choices["agent"], base)
-    space = SearchSpace(settings.space, space_name)
-    space.check(base, check_settings(base))
+    mdp = check_settings(base)
+    try:
+        space = SearchSpace(settings.space)
+        space.check(base, mdp)
+    except InputError as error:
+        raise InputError(f"tune={search.hydra.runtime.choices.tune}: {error}") from None
     words = [f"{group}={choice}" for group, choice in choices.items()]
     words += [word for word in of_run if word.partition("=")[0] not in (*CHOSEN, "seed", "hydra/launcher")]
-    spec = StudySpec(conf, base, choices, words, settings, space)
+    name, folder = str(settings.study), Path(str(settings.folder))
+    spec = StudySpec(name, folder, conf, base, choices, words, settings, space)
     if spec.held_out.stop > _LARGEST_SEED:
         raise InputError(f"seed={base.seed}: leaves no room for the seeds after it, below 2**32")
     return spec
@@ -169,7 +156,7 @@ def _completed(settings: TuneConfig, agent: str, base: TrainConfig) -> TuneConfi
         raise InputError(
             f"tune.study={study}: must consist of letters, digits and _.,=+-, e.g. {slug(study)}"
         )
-    workers = core_count() if settings.workers == -1 else settings.workers
+    workers = worker_count(settings.workers)
     together = settings.together or (1 if workers == 1 else math.ceil(_TRIALS_AT_ONCE / workers))
     together = together if base.agent.shape is not None else 1
     folder = settings.folder or f"runs/{study}"
@@ -182,22 +169,18 @@ class SearchSpace:
     """The dimensions, by key. Raises `InputError` for one that is wrong in itself."""
 
     dimensions: Mapping[str, DimensionConfig]
-    name: str  # of its file
 
     def __post_init__(self) -> None:
         if not self.distributions:
             raise InputError(
-                f"tune={self.name}: the search space is empty; its file needs '# @package tune.space' as "
-                "first line, then a line per key"
+                "the search space is empty; its file needs '# @package tune.space' as first line, then a "
+                "line per key"
             )
 
     @cached_property
     def distributions(self) -> dict[str, BaseDistribution]:
         """The dimensions as Optuna's."""
-        try:
-            return {key: _distribution(key, each) for key, each in self.dimensions.items()}
-        except InputError as error:
-            raise InputError(f"tune={self.name}: {error}") from None
+        return {key: _distribution(key, each) for key, each in self.dimensions.items()}
 
     def check(self, base: TrainConfig, mdp: Mdp) -> None:
         """Raise `InputError` unless every key is one of the configuration's and takes these values.
@@ -224,7 +207,7 @@ class SearchSpace:
         for values in alone:
             found = mistake(values)
             if found and all(mistake(other | values) for other in others):
-                raise InputError(f"tune={self.name}: {found}")
+                raise found
 
     def values(self, parameters: Values) -> dict[str, Any]:
         """The values of a trial's parameters, which are as Optuna stores them."""
