@@ -21,12 +21,12 @@ from gridworld.base.errors import InputError
 from gridworld.config.fields import Effect
 from gridworld.config.recipe_file import literal
 from gridworld.config.settings import ON_RESULT, effect_of, flat, with_effects
+from gridworld.report.statistics import share
 from gridworld.run.folder import shell_path
 from gridworld.run.reader import read_run
 from gridworld.sweeps.folder import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
-from gridworld.world.metrics import wilson_interval
 
-_HEADINGS = ("agent", "task", "settings", "certified", "median steps")
+_COLUMNS = {"agent": "<0", "task": "<0", "settings": "<0", "certified": ">0", "median steps": ">0"}
 _OF_SETTINGS = ON_RESULT - {Effect.SEED, Effect.LABELS, Effect.MACHINE}
 _MOST_NAMED = 3  # jobs
 _LONGEST = 60  # characters of settings
@@ -100,13 +100,13 @@ def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
     for (agent, task), alike in groups.items():
         labels = _differences([results[0] for results in alike.values()])
         for results, label in zip(alike.values(), labels, strict=True):
-            cells.append([agent, task, label, _certified(results), _steps(results)])
+            certified = share(sum(each.summary["certified"] for each in results), len(results))
+            cells.append([agent, task, label, str(certified), _steps(results)])
     if not cells:
         return []
-    keep = [0, 1, *([2] if any(row[2] for row in cells) else []), 3, 4]
-    table = [[row[column] for column in keep] for row in [list(_HEADINGS), *cells]]
-    forms = ["<0" if column < 3 else ">0" for column in keep]
-    lines = aligned([[f"{cell} " for cell in row] for row in table], forms)  # two blanks between columns
+    columns = [column for column in zip(_COLUMNS, *cells, strict=True) if any(column[1:])]
+    table = [[f"{cell} " for cell in row] for row in zip(*columns, strict=True)]
+    lines = aligned(table, [_COLUMNS[heading] for heading, *_ in columns])  # two blanks between columns
     if lost:
         named = f"{', '.join(lost[:_MOST_NAMED])}{', ...' if len(lost) > _MOST_NAMED else ''}"
         lines.append(f"{len(lost)} of {len(rows)} jobs are not counted: {named}")
@@ -148,12 +148,6 @@ def _differences(results: Sequence[_Result]) -> list[str]:
         text = " ".join(words)
         labels.append(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…")
     return labels
-
-
-def _certified(results: Sequence[_Result]) -> str:
-    count = sum(bool(result.summary["certified"]) for result in results)
-    low, high = wilson_interval(count, len(results))
-    return f"{count} of {len(results)} [{100 * low:.0f} %, {100 * high:.0f} %]"
 
 
 def _steps(results: Sequence[_Result]) -> str:

@@ -38,7 +38,6 @@ from gridworld.config.words import prepared
 from gridworld.config.worlds import each_once
 from gridworld.run.provenance import settings_hash
 from gridworld.training.setup import check_settings, notes
-from gridworld.world.mdp import Mdp
 
 RUNS_FILES = 4  # that a run has open: its lock, its curve, its events, its log
 _SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
@@ -172,7 +171,7 @@ class Configurations:
     def __call__(self, words: Sequence[str]) -> tuple[TrainConfig, Chosen]:
         """Compose a job's overrides."""
         overrides = OverridesParser.create(config_loader=self._loader).parse_overrides(prepared(words))
-        rest = [each for each in overrides if not self._is_choice(each)]
+        rest = [o for o in overrides if isinstance(o.value(), dict) or not self._is_group(o.key_or_group)]
         own = [place for place, override in enumerate(rest, 1) if not _is_value(override)]
         ours = rest[max(own, default=0) :]  # Hydra applies values in their order, after all choices
         lines = [str(each.input_line) for each in overrides if each not in ours]
@@ -196,9 +195,6 @@ class Configurations:
         chosen = Chosen.of(whole.hydra)
         return drop_hydra(whole), chosen
 
-    def _is_choice(self, override: Override) -> bool:
-        return self._is_group(override.key_or_group) and not isinstance(override.value(), dict)
-
 
 def _is_value(override: Override) -> bool:
     """Whether an override changes a plain value, and nothing else."""
@@ -219,22 +215,17 @@ def plan(
 ) -> list[Job]:
     """Compose and check the jobs, each once; `jobs` has (overrides, the swept ones among them) of each."""
     world = each_once()
-    known: dict[str, tuple[str, ...]] = {}  # notes
-
-    def noted(config: TrainConfig, mdp: Mdp) -> tuple[str, ...]:
-        key = repr(dataclasses.replace(config, seed=0))
-        if config.logging.progress and key not in known:
-            known[key] = tuple(notes(config, mdp))
-        return known.get(key, ())
-
+    known: dict[str, tuple[str, ...]] = {}  # notes, which are the same for each seed
     planned: dict[str, Job] = {}
     for given, swept in jobs:
         config, _, added = with_recipe_by_rule(prepared(given), configure, world)
-        said: tuple[str, ...] = ()
-        mistake, layout, memory = None, "", 0
+        mistake, layout, memory, said = None, "", 0, tuple[str, ...]()
         try:
             mdp = check_settings(config, world)
-            layout, said = mdp.text(), noted(config, mdp)
+            layout, key = mdp.text(), repr(dataclasses.replace(config, seed=0))
+            if config.logging.progress and key not in known:
+                known[key] = tuple(notes(config, mdp))
+            said = known.get(key, ())
             memory = config.agent.memory(mdp.num_states, config.n_envs, config.total_timesteps)
         except InputError as error:
             mistake = str(error)
