@@ -24,8 +24,7 @@ _SUFFIX = ".state"
 _LEAST_SECONDS = 2.0  # between two checkpoints, with "auto"
 _MOST_SHARE = 0.02  # of the time that may go to them, with "auto"
 _MOST_BYTES = 1 << 33  # of a file
-_DIGITS = 18
-MOST_STEPS = 10**_DIGITS - 1  # of a run: as many as its files' names, and counters of 64 bits, have room for
+_DIGITS = 18  # of the steps in a name: counters of 64 bits have room for as many
 
 
 def steps_of(path: Path) -> int:

@@ -46,25 +46,19 @@ def lengths(then: RunReader, config: TrainConfig) -> list[int]:
             f"{then.folder}: was trained on CUDA at once with other runs, on which its last bits depend, "
             "so it cannot be repeated; with hydra.sweeper.population=1 each run of a sweep trains alone"
         )
-    found = []
-    for again in then.resumptions:
-        if not again.get("total_timesteps"):
-            continue
-        step, old = again.get("step"), again.get("instead_of")
-        if type(old) is not int or type(step) is not int or old < 1:
+    longer = [again for again in then.resumptions if again.get("total_timesteps")]
+    found: list[Any] = [*(again.get("instead_of") for again in longer), config.total_timesteps]
+    for again, old in zip(longer, found, strict=False):
+        if type(old) is int and again["step"] < old:
             raise InputError(
-                f"{then.folder}: it was made longer, but its manifest does not say from what length "
-                "(resumed.instead_of); was it written by another version?"
+                f"{then.folder}: its length was changed after {again['step']:,} of {old:,} steps, before its "
+                "end; only a run that was made longer after its end can be repeated"
             )
-        if step < old:
-            raise InputError(
-                f"{then.folder}: its length was changed after {step:,} of {old:,} steps, before its end; "
-                "only a run that was made longer after its end can be repeated"
-            )
-        found.append(old)
-    found.append(config.total_timesteps)
-    if found != sorted(set(found)):
-        raise InputError(f"{then.manifest_file}: resumed: the lengths {found} must grow")
+    if any(type(length) is not int for length in found) or [0, *found] != sorted({0, *found}):
+        raise InputError(
+            f"{then.manifest_file}: resumed: the lengths {found} (instead_of, then the last) must grow; was "
+            "it written by another version?"
+        )
     return found
 
 

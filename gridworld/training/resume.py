@@ -25,7 +25,7 @@ from gridworld.config.fields import Use
 from gridworld.config.settings import flat, foreign
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig, World, compiled
-from gridworld.run.checkpoints import MOST_STEPS, Checkpoints, steps_of
+from gridworld.run.checkpoints import Checkpoints, steps_of
 from gridworld.run.console import Summary
 from gridworld.run.folder import CHECKPOINTS, CURVE
 from gridworld.run.provenance import environment, git, identity, settings, source_differences
@@ -218,10 +218,8 @@ def _why_not(path: Path, state: State | StateError, folder: Path, own: str) -> s
         return "parts of a checkpoint are missing"
     if state["identity"] != own:
         return "it belongs to another run"
-    if steps_of(path) != state["steps"] or not 0 < state["steps"] <= MOST_STEPS:
-        return "its number of steps differs from its name, or exceeds the run's"
-    if not math.isfinite(state["seconds"]):
-        return "its training time is impossible"
+    if not 0 < state["steps"] == steps_of(path) or not math.isfinite(state["seconds"]):
+        return "its number of steps differs from its name, or its training time is impossible"
     for name, mark in state["marks"].items():
         if not holds(folder, mark, LOGS[name]) and not (name == "events" and mark is None):
             return f"the file of the {name} has changed since"

@@ -213,11 +213,8 @@ class Trackers:
             from gridworld.training.wandb_log import begin
 
             self._wandb = begin(config, [identity(config, mdp.text()), folder.absolute()], state is not None)
-
-    @property
-    def write_scalars(self) -> WriteScalars | None:
-        """Writes numbers of a step; None where nothing takes them."""
-        return None if self.events is None and self._wandb is None else self._write_scalars
+        is_any = self.events is not None or self._wandb is not None
+        self.write_scalars: WriteScalars | None = self._write_scalars if is_any else None
 
     def _write_scalars(self, values: Mapping[str, float], step: int) -> None:
         if self.events is not None:

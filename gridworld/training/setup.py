@@ -21,6 +21,7 @@ from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_op
 from gridworld.world.mdp import Mdp
 from gridworld.world.solver import solved
 
+_with_exploring_starts = functools.lru_cache(4)(Mdp.with_exploring_starts)  # runs of a population share it
 SAME = 1e-9  # of the scale of the values: actions that differ by less are worth the same
 _QUICKLY_SOLVED = 6000  # outcomes of all states and actions
 
@@ -64,11 +65,6 @@ def make_context(config: TrainConfig, mdp: Mdp, write_scalars: WriteScalars | No
         callbacks=config.callbacks,
         features=config.observation.policy_kwargs(),
     )
-
-
-@functools.lru_cache(maxsize=4)  # the runs of a population share a world
-def _with_exploring_starts(mdp: Mdp, share: float) -> Mdp:
-    return mdp.with_exploring_starts(share)
 
 
 def import_for(config: TrainConfig) -> None:

@@ -11,7 +11,6 @@ import gzip
 import json
 import math
 import os
-import stat
 from dataclasses import dataclass, field
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from importlib.util import module_from_spec
@@ -27,7 +26,7 @@ from gridworld.base.atomic_write import write_bytes
 from gridworld.base.console import printable
 from gridworld.base.errors import InputError, reason
 from gridworld.base.user_input import as_path, limited
-from gridworld.run.folder import check_writable
+from gridworld.run.folder import check_file
 from gridworld.training.saved_run import SavedRun
 from gridworld.world.chain import Chain, one_hot_policy
 from gridworld.world.evaluation import Evaluator, PolicySnapshot
@@ -85,17 +84,11 @@ def check_certificate_file(path: Path) -> None:
     """Refuse a place where no certificate can be written, or where something else is than an older one."""
     try:
         os.fsencode(path)
-        if not path.absolute().parent.is_dir():
-            raise InputError(f"{path}: there is no folder {path.parent}")
-        check_writable(path.absolute().parent, "file")
-        begins = b""
-        if stat.S_ISREG(path.lstat().st_mode):
+        check_file(path, "file")
+        if path.exists():
             with (gzip.open if path.name.endswith(".gz") else open)(path, "rb") as file:
-                begins = file.read(len(_BEGINS))
-        if begins != _BEGINS:
-            raise InputError(f"{path}: is there and not a certificate; choose a new file")
-    except FileNotFoundError:
-        return
+                if file.read(len(_BEGINS)) != _BEGINS:
+                    raise InputError(f"{path}: is there and not a certificate; choose a new file")
     except InputError:
         raise
     except (OSError, EOFError, ValueError) as error:

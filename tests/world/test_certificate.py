@@ -334,8 +334,10 @@ def test_a_certificate_is_written_where_nothing_else_is(tmp_path: Path) -> None:
     before = (run_folder / "model.zip").read_bytes()
     (tmp_path / "link.json").symlink_to(run_folder / "model.zip")
     for name, why in (
-        *((name, "not a certificate") for name in ("run/model.zip", "run", "/dev/null", "link.json")),
-        *(("none/c.json", "there is no folder"), ("x" * 300, "too long"), ("\ud800", "surrogates")),
+        ("run/model.zip", "not a certificate"),
+        ("run", "is a folder"),
+        *((name, "is not a plain file") for name in ("/dev/null", "link.json")),
+        *(("none/c.json", "no such folder"), ("x" * 300, "too long"), ("\ud800", "surrogates")),
     ):
         with pytest.raises(InputError, match=why):
             gridworld.verify(run_folder, tmp_path / name)
