@@ -172,8 +172,8 @@ class Configurations:
         """Compose a job's overrides."""
         overrides = OverridesParser.create(config_loader=self._loader).parse_overrides(prepared(words))
         rest = [o for o in overrides if isinstance(o.value(), dict) or not self._is_group(o.key_or_group)]
-        own = [place for place, override in enumerate(rest, 1) if not _is_value(override)]
-        ours = rest[max(own, default=0) :]  # Hydra applies values in their order, after all choices
+        # Hydra applies values in their order, after all choices.
+        ours = list(itertools.takewhile(_is_value, reversed(rest)))[::-1]
         lines = [str(each.input_line) for each in overrides if each not in ours]
         base, chosen = self._base(*lines)
         settings = copy.deepcopy(base)

@@ -166,11 +166,10 @@ class _Sweep:
     def _look(self) -> None:
         """Write the table once workers that lost their sweep have ended, if they do soon."""
         end = time.monotonic() + _ORPHANS_END_WITHIN
-        while True:
-            self._rows = self._folder.rows(self._reasons)
-            if time.monotonic() >= end or all(row.status != RUNNING for row in self._rows.values()):
-                break
+        self._rows = self._folder.rows(self._reasons)
+        while time.monotonic() < end and any(row.status == RUNNING for row in self._rows.values()):
             time.sleep(_POLL_SECONDS)
+            self._rows = self._folder.rows(self._reasons)
         self._folder.write(self._rows)
 
     def _tick(self) -> None:

@@ -26,7 +26,6 @@ from gridworld.sweeps.launchers import Group, Launch, collect
 _FOLDER = ".slurm"  # in the sweep's: what submitit writes
 _SECONDS_BETWEEN_QUESTIONS = 5.0  # to Slurm, which answers others too
 _FILES_ARRIVE_WITHIN = 15.0  # seconds, over a network
-_SLURMS_NAMES = {"array_parallelism", "partition", "account", "qos", "constraint", "setup", "signal_delay_s"}
 
 SlurmTask = submitit.Job[list[str]]
 
@@ -99,7 +98,7 @@ def _submit(
 ) -> list[SlurmTask]:
     executor = submitit.AutoExecutor(folder=folder, cluster="slurm")
     parameters = {
-        f"slurm_{key}" if key in _SLURMS_NAMES else key: value
+        f"slurm_{key}": value
         for key, value in settings.items()
         if key not in ("jobs_per_task", "more") and value is not None
     }
