@@ -105,9 +105,10 @@ def _certified(agent: str, seeds: range) -> Callable[[], float]:
             config = compose([f"agent={agent}", f"seed={seed}"])
             mdp = config.env.compile()
             evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
-            made = config.agent.build(make_context(config, mdp))
+            context = make_context(config, mdp)
+            made = config.agent.build(context)
             config.evaluation.every, config.evaluation.stop_after = 1000, 1
-            curve = LearningCurve(evaluator, made, config)
+            curve = LearningCurve(evaluator, made, config, context.envs)
             started = time.perf_counter()
             made.learn(config.total_timesteps, curve.on_step)
             seconds.append(time.perf_counter() - started - curve.seconds)

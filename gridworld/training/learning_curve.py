@@ -92,7 +92,7 @@ class LearningCurve:
     """
 
     def __init__(
-        self, evaluator: Evaluator, agent: Agent, config: TrainConfig, envs: TrainingVectorEnv | None = None
+        self, evaluator: Evaluator, agent: Agent, config: TrainConfig, envs: TrainingVectorEnv
     ) -> None:
         self.evaluator = evaluator
         self.certificate = Certificate()
@@ -160,7 +160,7 @@ class LearningCurve:
         self._write_held()
         if self._next <= step:
             self._next += self._every * ((step - self._next) // self._every + 1)
-            self._due = self._take_returns()
+            self._due = self._envs.take_returns()
             evaluation = self._evaluation(step, self._due)
             if step < self._total:
                 self._write(evaluation)
@@ -176,7 +176,7 @@ class LearningCurve:
         self._held = None  # of this step, as it was before the last update
         if self.newest is not None and step == self.newest.step:
             return self.newest
-        evaluation = self._evaluation(step, self._due.merged(self._take_returns()))
+        evaluation = self._evaluation(step, self._due.merged(self._envs.take_returns()))
         self._write(evaluation)
         return evaluation
 
@@ -184,9 +184,6 @@ class LearningCurve:
         if self._held is not None:
             held, self._held = self._held, None
             self._write(*held)
-
-    def _take_returns(self) -> Returns:
-        return NO_EPISODES if self._envs is None else self._envs.take_returns()
 
     def _evaluation(self, step: int, returns: Returns) -> Evaluation:
         """Of the agent as it is now."""

@@ -19,7 +19,7 @@ from PIL import Image
 from gridworld.agents import Agent
 from gridworld.base.errors import InputError
 from gridworld.base.safe_read import sealed
-from gridworld.envs.training_env import Returns
+from gridworld.envs.training_env import NO_EPISODES, Returns
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.saved_run import SavedRun
 from gridworld.training.together import run_together
@@ -124,11 +124,21 @@ class Scripted:
         return f"after snapshot {self.calls}".encode()
 
 
-def follow(pattern: list[bool], *overrides: str, envs: Any = None) -> tuple[LearningCurve, list[bool]]:
+class Envs:
+    """Environments in which episodes with these returns end, and no others."""
+
+    def __init__(self, *returns: Returns) -> None:
+        self.returns = iter(returns)
+
+    def take_returns(self) -> Returns:
+        return next(self.returns, NO_EPISODES)
+
+
+def follow(pattern: list[bool], *overrides: str, returns: Any = ()) -> tuple[LearningCurve, list[bool]]:
     config = configure("evaluation.every=10", "logging.progress=false", *overrides)
     evaluator = Evaluator(config.env.compile(), 0.99, 100)
     agent = Scripted(np.argmax(evaluator.optimal_policy(), axis=1), pattern)
-    curve = LearningCurve(evaluator, agent, config, envs)  # type: ignore[arg-type]
+    curve = LearningCurve(evaluator, agent, config, Envs(*returns))  # type: ignore[arg-type]
     goes_on = [curve.on_step(10 * (index + 1)) > 0 for index in range(len(pattern))]
     return curve, goes_on
 
@@ -160,7 +170,7 @@ def test_the_model_of_an_evaluation_at_the_end_is_kept_for_a_longer_run() -> Non
     curve, _ = follow([False, True], "total_timesteps=20")
     assert (curve.best.step, curve.best.content) == (10, b"after snapshot 1")
     agent: Any = Scripted(np.zeros(30), [])  # has learned on meanwhile
-    longer = LearningCurve(curve.evaluator, agent, configure("total_timesteps=40"))
+    longer = LearningCurve(curve.evaluator, agent, configure("total_timesteps=40"), Envs())  # type: ignore[arg-type]
     longer.set_state(curve.get_state())
     longer.write_held_of_shorter_run()
     assert (longer.best.step, longer.best.content) == (20, b"after snapshot 2")
@@ -176,13 +186,8 @@ def test_the_last_row_does_not_stand_on_the_few_episodes_since_the_row_before(
 ) -> None:
     """It has those of the evaluation before too, which a later step would have had in a row of its own."""
 
-    class Envs:
-        returns = iter([Returns(1, -1.0), Returns(2, -2.0), Returns(4, -4.0)])
-
-        def take_returns(self) -> Returns:
-            return next(self.returns)
-
-    curve, _ = follow([False, True], f"total_timesteps={total}", envs=Envs())
+    returns = Returns(1, -1.0), Returns(2, -2.0), Returns(4, -4.0)
+    curve, _ = follow([False, True], f"total_timesteps={total}", returns=returns)
     curve.agent.pattern = iter([False])  # type: ignore[attr-defined]
     if step > 20:
         curve.on_step(step)
