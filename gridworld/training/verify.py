@@ -129,7 +129,7 @@ def proven(evaluator: Evaluator, greedy: IntArray) -> Verified:
     chain = Chain(mdp, one_hot_policy(greedy, mdp.num_actions))
     values = evaluator.values(chain)
     if bounds is not None:
-        candidates = [(bounds.upper, bounds.lower(chain.policy, values))]
+        candidates = [(bounds.upper, bounds.bound(values, chain.policy))]
     else:
         candidates = [(best, values), (np.round(best, _ROUNDED), np.round(values, _ROUNDED))]
         optimum, live = Chain(mdp, evaluator.optimal_policy()), (~mdp.absorbing).astype(np.float64)

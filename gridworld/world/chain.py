@@ -278,9 +278,7 @@ def discounted_visits(chain: Chain, gamma: float, stops: BoolArray) -> FloatArra
 
 def check_gamma(gamma: float) -> float:
     """A discount as a float, from 0 to 1 and not so near to 1 that the cost of a step is lost in rounding."""
-    if isinstance(gamma, bool) or not isinstance(gamma, int | float | np.number) or not 0 <= gamma <= 1:
-        raise InputError(f"gamma={gamma!r}: must be a number from 0 to 1")
-    Discount().check("gamma", float(gamma))
+    Discount().check("gamma", gamma)
     return float(gamma)
 
 
@@ -348,27 +346,20 @@ class Elimination:
         return x
 
 
-class BandedElimination:
-    """The same for a sparse system: its states are renumbered so that a narrow band holds all weights."""
+def _banded(weights: Any, leak: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """The same of a scipy CSR array (n, n): its states are renumbered so that a narrow band holds it."""
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-    def __init__(self, weights: Any, leak: FloatArray) -> None:
-        """Factor weights (n, n), a scipy CSR array without a diagonal, and leak (n,)."""
-        from scipy.sparse.csgraph import reverse_cuthill_mckee
-
-        self._order = reverse_cuthill_mckee(weights)
-        ordered = weights[self._order][:, self._order].tocoo()
-        size, band = len(leak), int(np.abs(ordered.row - ordered.col).max(initial=0))
-        check_memory(f"the exact solution of a world of {size:,} states", 8 * size * (2 * band + 1))
-        stored = np.zeros((size, 2 * band + 1))
-        stored[ordered.row, ordered.col - ordered.row + band] = ordered.data
-        down, right = stored.strides
-        table = as_strided(stored[0, band:], (size, size), (down - right, right))  # valid within the band
-        self._elimination = Elimination(table, leak[self._order], band)
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        x = np.empty_like(right)
-        x[self._order] = self._elimination.solve(right[self._order])
-        return x
+    order = reverse_cuthill_mckee(weights)
+    ordered = weights[order][:, order].tocoo()
+    size, band = len(leak), int(np.abs(ordered.row - ordered.col).max(initial=0))
+    check_memory(f"the exact solution of a world of {size:,} states", 8 * size * (2 * band + 1))
+    stored = np.zeros((size, 2 * band + 1))
+    stored[ordered.row, ordered.col - ordered.row + band] = ordered.data
+    down, right = stored.strides
+    table = as_strided(stored[0, band:], (size, size), (down - right, right))  # valid within the band
+    elimination, back = Elimination(table, leak[order], band), np.argsort(order)
+    return lambda sums: elimination.solve(sums[order])[back]
 
 
 def factor(weights: Any, leak: FloatArray) -> Callable[[FloatArray], FloatArray]:
@@ -389,4 +380,4 @@ def factor(weights: Any, leak: FloatArray) -> Callable[[FloatArray], FloatArray]
             return solve
     except RuntimeError:  # rounding has made it singular
         pass
-    return BandedElimination(weights, leak).solve
+    return _banded(weights, leak)

@@ -53,9 +53,9 @@ class Bounds:
         self._weight = chance / chance.sum(axis=2, keepdims=True)
         self._paid = np.where(chance > 0, paid, 0.0)
         self._following = np.where(chance > 0, following, self._states[:, None, None])
-        self.upper = self._bound(optimum.v, None)
+        self.upper = self.bound(optimum.v, None)
         best = one_hot_policy(optimum.optimal.argmax(axis=1), mdp.num_actions)
-        lower = self.lower(best, optimum.v)
+        lower = self.bound(optimum.v, best)
         self._least_regret = self.at_start(self.upper - lower)
         self._kept = self._starts, np.zeros(0)  # where a policy that keeps to these bounds goes, and how
         # (S, A), where an action is not known to keep to these bounds
@@ -64,7 +64,7 @@ class Bounds:
             self._others[self._states] |= ~(self._rest(lower, -1.0) <= 0)
 
     def regret(self, policy: FloatArray, values: FloatArray) -> float:
-        """The regret from the start that a policy (S, A) has at most; see `lower`."""
+        """The regret from the start that a policy (S, A) of these values V_π (S,) has at most."""
         where, how = self._kept
         if np.array_equal(policy[where], how):
             return self._least_regret
@@ -73,27 +73,22 @@ class Bounds:
             taken = (policy > 0)[:, :, None] & (self._mdp.probability > 0)
             reached = steps_from(self._starts, self._mdp.next_state, taken) >= 0
             if others[reached].any():
-                return self.at_start(self.upper - self.lower(policy, values))
+                return self.at_start(self.upper - self.bound(values, policy))
             where = np.flatnonzero(reached & self._live)
             self._kept = where, policy[where]
         return self._least_regret
-
-    def lower(self, policy: FloatArray, values: FloatArray) -> FloatArray:
-        """Numbers (S,) that are at most V_π in the states that a policy reaches, or -infinite.
-
-        Args:
-            policy: (S, A), its action probabilities.
-            values: V_π (S,), but for rounding.
-        """
-        return self._bound(values, policy)
 
     def at_start(self, gap: FloatArray) -> float:
         """Not less than the mean of a gap (S,) between two bounds, each of which was rounded once."""
         here, size = gap[self._starts], len(self._starts)
         return float(here @ self._share) * (1 + (2 * size + 8) * _UNIT) + size * _LEAST * bool(here.any())
 
-    def _bound(self, given: FloatArray, policy: FloatArray | None) -> FloatArray:
-        """x (S,) near to `given` with x ≥ max_a T_a x, or of a policy (S, A) with x ≤ T_π x."""
+    def bound(self, given: FloatArray, policy: FloatArray | None) -> FloatArray:
+        """x (S,) near to `given` with x ≥ max_a T_a x, or of a policy (S, A) with x ≤ T_π x; else ±infinite.
+
+        So it is at least V*, or at most V_π in the states that the policy reaches, which `given` is but for
+        rounding.
+        """
         sign = 1.0 if policy is None else -1.0
         given = np.where(self._live, given, 0.0)
         with np.errstate(all="ignore"):  # what is too large or too small has no bound

@@ -23,6 +23,7 @@ import numpy as np
 from gymnasium.wrappers import TimeLimit
 
 from gridworld.world.door.beliefs import Step, summed
+from gridworld.world.door.uniform import OPERATIONS
 
 if TYPE_CHECKING:
     from gridworld.world.door.search import Search, State
@@ -40,14 +41,6 @@ _READING = (
     *(f"{right}{name}" for name in ("and", "or", "xor", "lshift", "rshift", "matmul") for right in ("", "r")),
 )
 _COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")
-_MIRRORED = {"lt": "gt", "gt": "lt", "le": "ge", "ge": "le"}
-_OF_NUMPY: dict[Any, str] = {
-    getattr(np, name): short
-    for name, short in (
-        *(("add", "add"), ("subtract", "sub"), ("multiply", "mul"), ("less", "lt"), ("less_equal", "le")),
-        *(("greater", "gt"), ("greater_equal", "ge"), ("equal", "eq"), ("not_equal", "ne")),
-    )
-}
 
 
 class Read(BaseException):  # which an environment's `except Exception` does not catch
@@ -177,14 +170,11 @@ class Unread:
         return self.counter.compared(name, self.form, other)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
-        name = _OF_NUMPY.get(ufunc)
-        if name is None or method != "__call__" or options:
+        names = OPERATIONS.get(ufunc.__name__)
+        if names is None or method != "__call__" or options:
             self._read()
         one, other = inputs
-        if type(one) is Unread:
-            return getattr(one, f"__{name}__")(other)
-        mirrored = _MIRRORED.get(name, name) if name in _COMPARISONS else f"r{name}"
-        return getattr(other, f"__{mirrored}__")(one)
+        return getattr(one, names[0])(other) if type(one) is Unread else getattr(other, names[1])(one)
 
     def _read(self, *_: Any) -> NoReturn:
         raise Read({self.counter.key})

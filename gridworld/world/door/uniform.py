@@ -191,9 +191,9 @@ class Uniform:
             return self._refuse()
         if method == "__call__" and name in ("floor", "trunc"):
             return np.float64(self.__floor__() if name == "floor" else self.__int__())
-        if method != "__call__" or len(inputs) != 2 or name not in _OPERATIONS:
+        if method != "__call__" or len(inputs) != 2 or name not in OPERATIONS:
             return self._refuse()
-        ours, theirs = _OPERATIONS[name]
+        ours, theirs = OPERATIONS[name]
         one, other = inputs
         if isinstance(one, Uniform):
             return self._refuse() if isinstance(other, Uniform) else getattr(one, ours)(other)
@@ -202,11 +202,13 @@ class Uniform:
 
 _NUMPYS = (np.generic, np.ndarray)
 _OTHER_FLOATS = [np.dtype(each) for each in (np.float16, np.float32, np.longdouble)]
-_OPERATIONS = {  # by the name of numpy's function: for it on the left, and on the right
+OPERATIONS = {  # by the name of numpy's function: for it on the left, and on the right
     "less": ("__lt__", "__gt__"),
     "less_equal": ("__le__", "__ge__"),
     "greater": ("__gt__", "__lt__"),
     "greater_equal": ("__ge__", "__le__"),
+    "equal": ("__eq__", "__eq__"),
+    "not_equal": ("__ne__", "__ne__"),
     "add": ("__add__", "__radd__"),
     "multiply": ("__mul__", "__rmul__"),
     "subtract": ("__sub__", "__rsub__"),
