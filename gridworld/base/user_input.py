@@ -28,7 +28,7 @@ from importlib.util import module_from_spec, spec_from_file_location
 from os import PathLike
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 from gridworld.base.errors import OLD_GYM, InputError, install_command
 
@@ -101,7 +101,7 @@ def as_path(name: str, value: Any) -> Path:
     text = os.fspath(value) if isinstance(value, str | PathLike) else None
     if not isinstance(text, str) or "\0" in text:
         raise InputError(f"{name}={str(value)[:50]}: must be a path, a str or a Path")
-    return Path(value).expanduser()
+    return Path(os.path.expanduser(text))
 
 
 @contextmanager
@@ -120,16 +120,23 @@ def users_folder() -> Path:
     return _called_from[0] if _called_from else Path.cwd()
 
 
-@contextmanager
-def open_users_file(path: str | PathLike[str]) -> Iterator[BinaryIO | None]:
-    """Open a file, relative to the folder that the program was started in; None for a pipe or a device.
+def read_users_file(key: str, value: Any, kind: str, most: int) -> bytes:
+    """Read a file that a setting names, relative to the folder that the program was started in.
 
-    Raises `OSError` where it cannot be opened, `ValueError` for a path that is none.
+    It must be an ordinary file of at most `most` bytes; messages say that it must be `kind`.
     """
-    with open(
-        users_folder() / path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)
-    ) as file:
-        yield file if stat.S_ISREG(os.fstat(file.fileno()).st_mode) else None
+    path = users_folder() / as_path(key, value)
+    try:
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+            found = os.fstat(file.fileno())
+            if not stat.S_ISREG(found.st_mode):
+                raise InputError(f"{key}={value}: is not an ordinary file; give {kind}")
+            if found.st_size > most:
+                raise InputError(f"{key}={value}: is larger than {most / 2**20:,.0f} MiB; give a smaller one")
+            check_memory(value, 2 * found.st_size)
+            return file.read(most)
+    except OSError as error:
+        raise InputError(f"{key}={value}: cannot be read ({error.strerror}); give {kind}") from None
 
 
 def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:

@@ -31,7 +31,7 @@ from gridworld.base.bounds import positive_int
 from gridworld.base.errors import InputError
 from gridworld.base.user_input import check_memory
 from gridworld.envs import rendering as drawing
-from gridworld.world.mdp import IntArray, Mdp, leaves_of, taken
+from gridworld.world.mdp import IntArray, Mdp, frozen, taken
 from gridworld.world.shown import channels_first
 
 IMAGE_CELL_SIZE = 8  # pixels; 5x6 cells and their border make 56 x 64, enough for SB3's NatureCNN
@@ -149,9 +149,7 @@ def make_observation(mdp: Mdp, kind: str, cell_size: int = IMAGE_CELL_SIZE) -> O
         *others, last = KINDS
         raise InputError(f"observation kind {kind!r}: must be {', '.join(others)} or {last}")
     space, stored = KINDS[kind](mdp, cell_size)
-    for each in leaves_of(stored) if stored is not None else ():
-        each.setflags(write=False)
-    return ObservationTable(kind, space, mdp.num_states, stored)
+    return ObservationTable(kind, space, mdp.num_states, frozen(stored))
 
 
 class TableObservation(gym.ObservationWrapper[Any, int, int], gym.utils.RecordConstructorArgs):

@@ -20,19 +20,10 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-from gridworld.base.bounds import STEP_LIMIT, positive_int
+from gridworld.base.bounds import STEP_LIMIT, Bounds, positive_int
 from gridworld.base.errors import InputError
 from gridworld.world.layout import CLASSIC, MOVES, NUM_COLS, NUM_ROWS, Cell, Layout, load
-from gridworld.world.mdp import (
-    BoolArray,
-    FloatArray,
-    IntArray,
-    Mdp,
-    checked_reward,
-    finite,
-    frozen,
-    grid_places,
-)
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, checked_reward, frozen, grid_places
 
 ACTION_NAMES = ("up", "right", "down", "left")
 NUM_ACTIONS = len(MOVES)
@@ -132,9 +123,8 @@ def compile_mdp(
             f"layout={layout!r:.50}: must be a Layout; load({layout!r:.50}) reads a map by name or file, and "
             f"compile_env({layout!r:.50}) compiles the world of that name, with its rewards"
         )
-    slip = finite("slip", slip)
-    if not 0 <= slip <= 1:
-        raise InputError(f"slip={slip}: must be a probability, from 0 to 1")
+    Bounds(0, 1).check("slip", slip)
+    slip = float(slip)
     given = {"step_reward": step_reward, "goal_reward": goal_reward, "trap_reward": trap_reward}
     rewards: dict[str, Any] = {key: checked_reward(key, value) for key, value in given.items()}
     step_reward, goal_reward, trap_reward = rewards.values()

@@ -19,17 +19,18 @@ back to.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
-from os import PathLike, fspath
+from os import PathLike
 from typing import Any, NamedTuple
 
 from gridworld.base.bounds import positive_int
 from gridworld.base.errors import InputError
-from gridworld.base.user_input import open_users_file
+from gridworld.base.user_input import as_path, read_users_file, users_folder
 
 Cell = tuple[int, int]  # (row, column), both from 0, the top-left cell first
 
@@ -129,7 +130,6 @@ def parse(text: str, name: str, rewards: Mapping[str, float] | None = None) -> L
     paid = _paid(name, lines.pop(0) if "=" in lines[0] else "", rewards or {})
     if not lines:
         raise InputError(f"{name}: there is no map below the rewards of its ends")
-    _check_size(name, len(lines), len(lines[0]))
     found: dict[str, list[Cell]] = {tile: [] for tile in [*_TILES, *paid]}
     for row, line in enumerate(lines):
         for col, tile in enumerate(line):
@@ -219,39 +219,19 @@ def shipped_layouts() -> tuple[str, ...]:
 
 
 def _read(layout: str | PathLike[str], rewards: Mapping[str, float] | None) -> Layout:
-    given = fspath(layout) if isinstance(layout, str | PathLike) else None
-    if not isinstance(given, str) or not given:
-        raise InputError(f"layout={layout!r}: must be a layout's name, a map file's path or a Layout")
-    if given in shipped_layouts():
-        text = files("gridworld").joinpath("layouts", f"{given}.txt").read_text("utf-8")
-        return parse(text, given, rewards)
-    try:
-        # A row may end in blanks or \r\n; far more than that is not a map, and is not read.
-        with open_users_file(given) as file:
-            raw = None if file is None else file.read(4 * MAX_CELLS + 1)
-        if raw is None:
-            raise InputError(f"layout {given!r}: is not an ordinary file; give a readable text file")
-        if len(raw) > 4 * MAX_CELLS:
-            raise InputError(f"{given}: the map is too large; at most {MAX_CELLS} cells are allowed")
-        return parse(raw.decode("utf-8-sig"), given, rewards)
-    except UnicodeDecodeError as error:
-        raise InputError(f"{given}: not a text file (byte {error.start + 1} is not UTF-8)") from None
-    except InputError:
-        raise
-    except (FileNotFoundError, NotADirectoryError, ValueError):
+    path = users_folder() / as_path("layout", layout)
+    name = os.fspath(layout)
+    if name in shipped_layouts():
+        return parse(files("gridworld").joinpath("layouts", f"{name}.txt").read_text("utf-8"), name, rewards)
+    if not os.path.exists(path):
         shipped = ", ".join(shipped_layouts())
-        raise InputError(f"layout {given!r}: neither a shipped layout ({shipped}) nor a file") from None
-    except OSError as error:
-        raise InputError(
-            f"layout {given!r}: the map cannot be read ({error.strerror}); give a readable text file"
-        ) from None
-
-
-def _check_size(name: str, num_rows: int, num_cols: int) -> None:
-    if num_rows * num_cols > MAX_CELLS:
-        raise InputError(
-            f"{name}: {num_rows} rows of {num_cols} columns are too large; at most {MAX_CELLS} cells fit"
-        )
+        raise InputError(f"layout {name!r}: neither a shipped layout ({shipped}) nor a file")
+    # A row may end in blanks or \r\n; far more than that is not a map, and is not read.
+    content = read_users_file("layout", layout, "a readable text file", 4 * MAX_CELLS)
+    try:
+        return parse(content.decode("utf-8-sig"), name, rewards)
+    except UnicodeDecodeError as error:
+        raise InputError(f"{name}: not a text file (byte {error.start + 1} is not UTF-8)") from None
 
 
 def _check(layout: Layout) -> None:
@@ -260,7 +240,9 @@ def _check(layout: Layout) -> None:
 
     positive_int("num_rows", layout.num_rows)
     positive_int("num_cols", layout.num_cols)
-    _check_size(layout.name, layout.num_rows, layout.num_cols)
+    if layout.num_rows * layout.num_cols > MAX_CELLS:
+        size = f"{layout.num_rows} rows of {layout.num_cols} columns are too large"
+        raise refused(size, f"at most {MAX_CELLS} cells fit")
     for what in ("start", "goal"):
         if not getattr(layout, f"{what}s"):
             raise refused(f"there is no {what}", f"mark at least one cell with {what[0].upper()!r}")

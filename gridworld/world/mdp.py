@@ -11,23 +11,20 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from numbers import Real
 from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.base.bounds import Bounds
-from gridworld.base.errors import InputError
 
 IntArray = NDArray[np.integer[Any]]
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-Table = TypeVar("Table", bound=NDArray[Any])
+Table = TypeVar("Table")
 
 # Of a reward, unless it is 0: the squared sum of 100,000 of the largest is finite, and the smallest is larger
 # than what counts as 0.
@@ -177,8 +174,7 @@ class Mdp:
 
     def shown_digest(self) -> str:
         """The sha256 of the tables and of what the environment shows in each state."""
-        shown = [] if self.own_observation is None else leaves_of(self.own_observation)
-        parts = (np.ascontiguousarray(each).tobytes() for each in shown)
+        parts = (np.ascontiguousarray(each).tobytes() for each in leaves_of(self.own_observation))
         return hashlib.sha256(self.digest().encode() + b"".join(parts)).hexdigest()
 
     def text(self) -> str:
@@ -277,11 +273,11 @@ def grid_places(num_rows: int, num_cols: int) -> NDArray[np.int64]:
 
 
 def leaves_of(rows: Any) -> Iterator[NDArray[Any]]:
-    """The arrays of what is shown in all states, in the order of their space."""
+    """The arrays of what is shown in all states, if anything is, in the order of their space."""
     if isinstance(rows, dict | tuple):
         for each in rows.values() if isinstance(rows, dict) else rows:
             yield from leaves_of(each)
-    else:
+    elif rows is not None:
         yield rows
 
 
@@ -295,28 +291,17 @@ def taken(rows: Any, states: Any) -> Any:
 
 
 def frozen(table: Table) -> Table:
-    """The same array, made read-only."""
-    table.setflags(write=False)
+    """The same array, or arrays as `leaves_of` has them, made read-only."""
+    for each in leaves_of(table):
+        each.setflags(write=False)
     return table
 
 
 def checked_reward(what: str, value: Any) -> float:
-    """A finite number that is neither too large nor too small to be added up."""
-    number = finite(what, value)
+    """A number that is neither too large nor too small to be added up; refuses anything else."""
+    number = value.item() if isinstance(value, np.generic) else value
     Bounds(-MOST_REWARD, MOST_REWARD, least=LEAST_REWARD).check(what, number)
-    return number
-
-
-def finite(what: str, value: Any) -> float:
-    """A finite number as a float; refuses anything else."""
-    try:
-        plain = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
-        number = float(value) if plain else math.nan
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise InputError(f"{what}={str(value)[:50]}: must be a finite number")
-    return number
+    return float(number)
 
 
 def backup(

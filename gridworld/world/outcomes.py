@@ -27,7 +27,6 @@ from gridworld.world.mdp import (
     Mdp,
     checked_reward,
     frozen,
-    leaves_of,
     resting_states,
     steps_from,
     taken,
@@ -113,15 +112,9 @@ def mdp_from_outcomes(
         places=None if places is None else frozen(places[number].astype(np.int64)),
         panel_names=tuple(panel_names),
         max_episode_steps=None if max_episode_steps is None else int(max_episode_steps),
-        own_observation=_frozen(taken(own_observation, number)),
+        own_observation=frozen(taken(own_observation, number)),
         own_space=own_space,
     )
-
-
-def _frozen(rows: Any) -> Any:
-    for each in leaves_of(rows) if rows is not None else ():
-        frozen(each)
-    return rows
 
 
 def _ends(outcomes: Outcomes) -> tuple[IntArray, BoolArray, IntArray, IntArray]:

@@ -31,7 +31,7 @@ import numpy as np
 from gridworld.base.errors import InputError
 from gridworld.world import levels
 from gridworld.world.chain import DENSE_STATES, ORDINARY_GAMMA, Chain, Evaluation, check_gamma, one_hot_policy
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup, steps_to
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, backup, frozen, steps_to
 
 # Two actions whose values agree to this relative precision are equally good. Rounding stays far below it.
 TIE = 1e-9
@@ -93,7 +93,7 @@ def solved(mdp: Mdp, gamma: float) -> Solution:
     if gamma not in solutions:
         solution = value_iteration(mdp, gamma)
         for table in (solution.v, solution.q, solution.optimal, solution.scale):
-            table.setflags(write=False)
+            frozen(table)
         while len(solutions) >= _MOST_SOLUTIONS:
             del solutions[next(iter(solutions))]
         solutions[gamma] = solution

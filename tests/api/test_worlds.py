@@ -162,7 +162,7 @@ def test_a_run_is_scored_on_its_own_world() -> None:
             lambda: gridworld.make_vec_env("cliff", layout="four_rooms"),
             "env=cliff, layout=four_rooms: are 2 w",
         ),
-        (lambda: gridworld.make_vec_env(slip=2), "slip=2.0: must be a probability"),
+        (lambda: gridworld.make_vec_env(slip=2), "slip=2: must be from 0 to 1"),
         (lambda: gridworld.make_vec_env(layout="nowhere"), "neither a shipped layout"),
         (lambda: gridworld.make_vec_env(observation="pixels"), "observation kind 'pixels': must be one_hot"),
         (lambda: gridworld.make_vec_env(n_envs=0), "num_envs"),

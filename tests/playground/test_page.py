@@ -336,7 +336,7 @@ def test_python_takes_the_words_of_the_command_and_a_run(run: Path) -> None:
         ("nowhere.txt", "neither a shipped layout"),
         ("runs/", "runs: no such folder"),
         ("env=cliff maze", "maze: is not a setting; write env=maze"),
-        ("env.slip=2", "slip=2.0: must be a probability"),
+        ("env.slip=2", "slip=2.0: must be from 0 to 1"),
         ("cliff --out page", "--out page: must be the name of a file that ends with .html"),
         ("cliff --out ../page.html", "leads out of the current folder"),
         ("cliff --best", "--best: chooses between the models of a run"),

@@ -26,18 +26,17 @@ A run's world holds the fields of an `Mdp` as they are. What other programs writ
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Mapping
-from os import PathLike, fspath
-from pathlib import Path
+from os import PathLike
 from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Dict
 from numpy.typing import NDArray
 
+from gridworld.base.bounds import positive_int
 from gridworld.base.errors import InputError, in_short
-from gridworld.base.user_input import check_memory, named_object, npz_arrays, npz_bytes, open_users_file
+from gridworld.base.user_input import as_path, named_object, npz_arrays, npz_bytes, read_users_file
 from gridworld.world.mdp import Mdp, frozen, leaves_of
 from gridworld.world.outcomes import Outcomes, checked_text, mdp_from_outcomes, verified
 from gridworld.world.shown import space_of_text, space_text
@@ -64,8 +63,10 @@ def load_world(path: str | PathLike[str]) -> Mdp:
     The module says what is in them. Without a `name` in it, the world is named after the file. Raises
     InputError if it is no such file.
     """
-    content, where = _read(path), Path(path)
-    if (ending := where.suffix.lower()) in _TEXTS:
+    where = as_path("env.path", path)
+    is_text = (ending := where.suffix.lower()) in _TEXTS
+    content = read_users_file("env.path", path, _FILES, _MOST_TEXT if is_text else _MOST_BYTES)
+    if is_text:
         return world_of_text(where.stem, content, str(path))
     if ending == ".mat":
         return mdp_from_arrays(where.stem, mat_arrays(content, str(path)), str(path))
@@ -96,6 +97,7 @@ def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
         if is_matrices
         else _outcomes(where, given)
     )
+    limit: Any = given["max_episode_steps"].tolist() if "max_episode_steps" in given else None
     places = given.get("places")
     if places is not None and places.ndim == 2 and places.shape[1] == 2 and places.dtype.kind in "iu":
         places = np.concatenate([np.where(places[:, :1] < 0, -1, 0), places], axis=1)  # of one panel
@@ -104,7 +106,7 @@ def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
         tables,
         action_names=_names(where, "action_names", given.get("action_names")),
         places=places,
-        max_episode_steps=_whole(where, "max_episode_steps", given.get("max_episode_steps")),
+        max_episode_steps=limit,
     )
     called = checked_text(where, "name", given["name"]) if "name" in given else name
     return verified(dataclasses.replace(mdp, name=called), where)
@@ -192,39 +194,6 @@ def _names(where: str, key: str, given: NDArray[Any] | None) -> list[str] | None
     return [checked_text(where, key, name) for name in given]
 
 
-def _whole(where: str, key: str, given: NDArray[Any] | None) -> int | None:
-    if given is None:
-        return None
-    if given.ndim != 0 or given.dtype.kind not in "iu":
-        raise InputError(f"{where}: {key} is {given.dtype} {given.shape}, must be one whole number")
-    return int(given)
-
-
-def _read(path: str | PathLike[str]) -> bytes:
-    given = fspath(path) if isinstance(path, str | PathLike) else None
-    if not isinstance(given, str) or not given:
-        raise InputError(f"env.path={path!r}: must be the path of {_FILES}")
-    try:
-        with open_users_file(given) as file:
-            if file is None:
-                raise InputError(f"env.path={given}: is not an ordinary file; give {_FILES}")
-            size = os.fstat(file.fileno()).st_size
-            most = _MOST_TEXT if given.lower().endswith(_TEXTS) else _MOST_BYTES
-            if size > most:
-                raise InputError(
-                    f"env.path={given}: is larger than {most / 2**20:,.0f} MiB; give a smaller world"
-                )
-            check_memory(given, 2 * size)
-            return file.read(_MOST_BYTES)
-    except InputError:
-        raise
-    except IsADirectoryError:
-        raise InputError(f"env.path={given}: is a folder; give {_FILES}") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", error)
-        raise InputError(f"env.path={given}: cannot be read ({reason}); give {_FILES}") from None
-
-
 def world_bytes(mdp: Mdp) -> bytes:
     """A world as the content of a file, its tables bit for bit, but for what only `GridMdp` has."""
     arrays = {"format": _FORMAT}
@@ -248,8 +217,6 @@ def _from_fields(found: dict[str, NDArray[Any]], where: str) -> Mdp:
     fields = {field.name: field for field in dataclasses.fields(Mdp)}
     if not np.array_equal(found.pop("format", np.array("")), _FORMAT):
         raise InputError(f"{where}: not a world of this version, must contain format={_FORMAT}")
-    for key in ("thresholds", "absorbing"):  # of older files; they follow from the others
-        found.pop(key, None)
     own = _own(found, where)
     needed = {name for name, field in fields.items() if field.default is dataclasses.MISSING}
     if not needed <= found.keys() <= fields.keys():
@@ -262,9 +229,9 @@ def _from_fields(found: dict[str, NDArray[Any]], where: str) -> Mdp:
             values[key] = checked_text(where, key, found[key])
     for key in ("action_names", *_LISTS):
         values[key] = tuple(_names(where, key, found.get(key)) or ())
-    values["max_episode_steps"] = _whole(where, "max_episode_steps", found.get("max_episode_steps"))
-    for each in leaves_of(own.get(_OWN, {})):
-        frozen(each)
+    if (limit := found.get("max_episode_steps")) is not None:
+        values["max_episode_steps"] = positive_int(f"{where}: max_episode_steps", limit.tolist())
+    frozen(own.get(_OWN))
     tables = {key: frozen(value) for key, value in values.items() if isinstance(value, np.ndarray)}
     return verified(Mdp(**{**values, **tables}), where)
 

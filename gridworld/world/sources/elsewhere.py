@@ -80,7 +80,7 @@ def _started(environment: Mapping[str, str]) -> subprocess.Popen[str]:
 def content_digest(mdp: Mdp) -> str:
     """A digest that is the same however the states are numbered: of what they show, pay and lead to."""
     states = np.flatnonzero(mdp.reachable).tolist()
-    shown = [mdp.number] if mdp.own_observation is None else list(leaves_of(mdp.own_observation))
+    shown = list(leaves_of(mdp.own_observation)) or [mdp.number]
     labels: dict[int, bytes] = {
         state: _hash(bool(mdp.terminal[state]), *(each[state].tobytes() for each in shown))
         for state in states

@@ -186,7 +186,7 @@ def test_everything_optional(tmp_path):
         ({"places": [[0, -2, 0], [0, 0, 0]]}, "has a place below -1"),
         ({"places": [[0, 0, 0], [0, 10**9, 10**9]]}, "places are 1 panels of 1,000,000,001 rows"),
         ({"max_episode_steps": 0}, "max_episode_steps=0: must be a whole number of at least 1"),
-        ({"max_episode_steps": 1.5}, "max_episode_steps is float64"),
+        ({"max_episode_steps": 1.5}, "max_episode_steps=1.5: must be a whole number"),
         ({"name": "two\nlines"}, "name is .* must be 1 to 200 letters"),
     ],
 )
@@ -205,8 +205,8 @@ def test_no_file_of_arrays(tmp_path, monkeypatch):
     monkeypatch.setattr("gridworld.world.sources.arrays._MOST_BYTES", 2**20)
     for path, told in (
         (tmp_path / "none.npz", "env.path=.*none.npz: cannot be read .No such file"),
-        (tmp_path, "env.path=.*: is a folder; give an .npz, .mat, .MDP or .POMDP file"),
-        (3, "env.path=3: must be the path"),
+        (tmp_path, "env.path=.*: cannot be read .Is a directory.; give an .npz, .mat, .MDP or .POMDP file"),
+        (3, "env.path=3: must be a path"),
         (tmp_path / "text.npz", "text.npz: not an .npz file of arrays that can be read"),
         (tmp_path / "one.npy", "not an .npz file of arrays"),
         (tmp_path / "pipe.npz", "is not an ordinary file"),

@@ -462,7 +462,7 @@ def test_what_is_no_mat(tmp_path, monkeypatch):
 def test_texts_have_a_largest_size(tmp_path, monkeypatch):
     monkeypatch.setattr("gridworld.world.sources.arrays._MOST_TEXT", 2**20)
     path = written(tmp_path, "long.MDP", GOOD + "#" * 2**20)
-    with pytest.raises(InputError, match=r"long.MDP: is larger than 1 MiB; give a smaller world"):
+    with pytest.raises(InputError, match=r"long.MDP: is larger than 1 MiB; give a smaller one"):
         load_world(path)
     path.write_bytes(b"states: \xff")
     with pytest.raises(InputError, match=r"long.MDP: not a text file \(byte 9 is not UTF-8\)"):
