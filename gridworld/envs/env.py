@@ -99,10 +99,6 @@ class GridWorldEnv(gym.Env[int, int]):
         )
         if not isinstance(world, GridMdp):
             raise InputError(f"mdp={world.name}: has no map; a batch of it is GridWorldVectorEnv(mdp=...)")
-        if (world.thresholds != world.thresholds[0, 0]).any():
-            raise InputError(
-                f"mdp={world.name}: slips differently in some cells; use GridWorldVectorEnv(mdp=...)"
-            )
         self._mdp: GridMdp = world
         self._thresholds: tuple[float, ...] = tuple(world.thresholds[0, 0].tolist())  # of all cells and moves
         self.render_mode = render_mode

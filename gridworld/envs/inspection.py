@@ -9,6 +9,7 @@ the batches above environments, known by their classes.
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -30,7 +31,7 @@ from gridworld.world.door.attributes import layers_of
 from gridworld.world.door.world import Found, enumerated, traits
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import Layout, load
-from gridworld.world.mdp import Mdp
+from gridworld.world.mdp import Mdp, leaves_of
 from gridworld.world.outcomes import verified
 from gridworld.world.sources.environment import as_environment, found_by, shortcut, step_limit
 
@@ -161,7 +162,7 @@ def _task_of_found(found: Found) -> Task:
         found.mdp,
         found.mdp.max_episode_steps,
         is_found=True,
-        seen=functools.cache(lambda: tabulated(found.space, found.rows, found.mdp.num_states)),
+        seen=functools.cache(lambda: ObservationTable(found.space, found.mdp.num_states, found.rows)),
         masks=lambda: found.masks,
     )
 
@@ -214,38 +215,27 @@ def _copies(batch: Any, **bounds: Any) -> Task:
         for index, other in enumerate(others, 1)
     }
 
-    def refuse_others(is_same: Callable[[Task], bool], mistake: str) -> None:
+    def shared(
+        of: Callable[[Any], Any], mistake: str, is_same: Callable[[Any, Any], bool] = operator.eq
+    ) -> Any:
+        """What is the same in all environments; refuses one in which it is not."""
+        mine = of(task)
         for index, other in tasks.items():
-            if not is_same(other):
+            if not is_same(mine, of(other)):
                 raise InputError(
                     f"env: environment {index} of the {type(batch).__name__} {mistake} environment 0; give "
                     "one of them, or a batch with a single task"
                 )
+        return mine
 
-    def seen() -> ObservationTable:
-        table = task.seen()  # type: ignore[misc]
-
-        def shows_the_same(other: Task) -> bool:
-            theirs = other.seen()  # type: ignore[misc]
-            return table.space == theirs.space and equal(_rows(table), _rows(theirs))
-
-        refuse_others(shows_the_same, "shows states differently from")
-        return table
-
-    def masks() -> NDArray[np.bool_] | None:
-        mine: Any = task.masks()
-        refuse_others(lambda other: np.array_equal(mine, other.masks()), "masks actions differently from")  # type: ignore[arg-type]
-        return mine  # type: ignore[no-any-return]
-
-    text, limit = Mdp.text(task.mdp), task.own_limit
-    refuse_others(
-        lambda other: (Mdp.text(other.mdp), other.own_limit) == (text, limit), "is a different task from"
+    shared(lambda each: (Mdp.text(each.mdp), each.own_limit), "is a different task from")
+    return replace(
+        task,
+        seen=functools.cache(
+            lambda: shared(lambda each: each.seen(), "shows states differently from", alike)
+        ),
+        masks=lambda: shared(lambda each: each.masks(), "masks actions differently from", np.array_equal),
     )
-    return replace(task, seen=functools.cache(seen), masks=masks)
-
-
-def _rows(table: ObservationTable) -> Any:
-    return table.stored if isinstance(table.stored, dict) else table.table()
 
 
 def _batch(env: Any, **bounds: Any) -> Task:
@@ -282,22 +272,18 @@ def _batch(env: Any, **bounds: Any) -> Task:
                 "evaluated exactly; leave it out"
             )
         assert below.seen is not None
-        rows = _BY_METHOD[kind](env, _rows(below.seen()))
-        return tabulated(env.observation_space, rows, below.mdp.num_states)
+        rows = _BY_METHOD[kind](env, below.seen().table())
+        return ObservationTable(env.observation_space, below.mdp.num_states, rows)
 
     return replace(below, seen=seen, normalizer=env if kind == "normalize" and env.norm_obs else None)
 
 
-def equal(one: Any, other: Any) -> bool:
-    """Whether two tables of observations are the same, to the bit."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)
-    return bool(np.array_equal(one, other)) and np.asarray(one).dtype == np.asarray(other).dtype
-
-
-def tabulated(space: gym.Space[Any], rows: Any, num_states: int) -> ObservationTable:
-    """The table of observations `rows`, (S, *shape) or such arrays by the keys of a Dict."""
-    return ObservationTable("of its own", space, num_states, rows)
+def alike(one: ObservationTable, other: ObservationTable) -> bool:
+    """Whether all states are shown the same, to the bit."""
+    return one.space == other.space and all(
+        np.array_equal(mine, theirs) and mine.dtype == theirs.dtype
+        for mine, theirs in zip(leaves_of(one.table()), leaves_of(other.table()), strict=True)
+    )
 
 
 def observation_like(mdp: Mdp, space: gym.Space[Any]) -> ObservationTable:

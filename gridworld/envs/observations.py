@@ -43,14 +43,14 @@ _SMALL_TABLE_BYTES = 2**24  # up to here a table is kept, beyond it one-hot rows
 
 @dataclass(frozen=True, eq=False)
 class ObservationTable:
-    """One observation per state, of a kind of `KINDS`; `space` is of one observation."""
+    """One observation per state; `space` is of one observation, and `kind` of `KINDS`, if it is of these."""
 
-    kind: str
     space: gym.Space[Any]
     num_states: int
     # (S, *shape), read-only, or such by the keys of a Dict; None: one-hot rows, written when they are asked
     # for
     stored: Any
+    kind: str = "of its own"
 
     def rows(self, states: IntArray, out: NDArray[Any] | None = None) -> NDArray[Any]:
         """Look up the observations (..., *shape) of states (...), in `out` or a fresh array."""
@@ -149,7 +149,7 @@ def make_observation(mdp: Mdp, kind: str, cell_size: int = IMAGE_CELL_SIZE) -> O
         *others, last = KINDS
         raise InputError(f"observation kind {kind!r}: must be {', '.join(others)} or {last}")
     space, stored = KINDS[kind](mdp, cell_size)
-    return ObservationTable(kind, space, mdp.num_states, frozen(stored))
+    return ObservationTable(space, mdp.num_states, frozen(stored), kind)
 
 
 class TableObservation(gym.ObservationWrapper[Any, int, int], gym.utils.RecordConstructorArgs):

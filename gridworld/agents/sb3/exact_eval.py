@@ -32,7 +32,7 @@ from gridworld.base.console import tell
 from gridworld.base.errors import InputError, on_a_line
 from gridworld.config.compose import named_world
 from gridworld.engine.sb3_format import model_file
-from gridworld.envs.inspection import Task, equal, observation_like, tabulated, task_of
+from gridworld.envs.inspection import Task, alike, observation_like, task_of
 from gridworld.envs.observations import KINDS, ObservationTable
 from gridworld.run.folder import BEST_MODEL, EVALUATIONS
 from gridworld.run.writer import write_evaluations
@@ -104,7 +104,7 @@ class ForeignPolicy:
         seen, wanted = None if self._task.seen is None else self._task.seen(), self._policy.observation_space
         if seen is not None and seen.space != wanted and seen.stored is not None:
             space, rows = channels_first(seen.space, seen.stored)
-            seen = seen if space != wanted else tabulated(space, rows, seen.num_states)
+            seen = seen if space != wanted else ObservationTable(space, seen.num_states, rows)
         if seen is not None and seen.space == wanted:
             return seen
         if seen is not None and seen.kind not in KINDS:
@@ -130,8 +130,8 @@ class ForeignPolicy:
                 f"the model: its training observations are unknown ({error}); give an environment that "
                 "shows the same ones"
             ) from None
-        alike = shown is not None and shown.space == guess.space and equal(shown.table(), guess.table())
-        if not alike and (shown is None or shown.kind not in KINDS):
+        is_alike = shown is not None and alike(shown, guess)
+        if not is_alike and (shown is None or shown.kind not in KINDS):
             raise InputError(
                 f"the model was trained on custom observations, and {guess.kind} of this world merely has "
                 "the same space; give an environment with the wrappers of training"
