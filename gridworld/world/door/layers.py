@@ -235,13 +235,13 @@ class Layers:
 
     def take(self, without: Sequence[str] = (), with_counts: bool = False) -> bytes:
         """A copy of the state. Equal copies are of equal states; equal states may have several."""
-        parts = []
-        for held in self._held(without, with_counts):
+        parts, layers = [], self._held(without, with_counts)
+        for held in layers:
             names = tuple(held)
             if names not in self._names:
                 self._names[names] = len(self._names)
             parts.append([self._names[names], *held.values()])
-        return self.dump(parts)
+        return self._dumped(parts, layers)
 
     def _held(self, without: Sequence[str], with_counts: bool = False) -> list[dict[str, Any]]:
         held = []
@@ -344,13 +344,15 @@ class Layers:
         found = {}
         for number, held in enumerate(self._held(ignore)):
             for name, value in held.items():
-                try:
-                    found[number, name] = self.dump(value)
-                except InputError:
-                    raise
-                except Exception as error:  # whatever the classes in it raise
-                    raise self._uncopied([{name: value}], error) from error
+                found[number, name] = self._dumped(value, [{name: value}])
         return found
+
+    def _dumped(self, thing: Any, held: list[dict[str, Any]]) -> bytes:
+        """A copy of what some layers hold; refuses an attribute that cannot be copied."""
+        try:
+            return self.dump(thing)
+        except Exception as error:  # whatever the classes in it raise
+            raise self._uncopied(held, error) from error
 
     def dump(self, thing: Any, known_objects: dict[Any, Any] | None = None) -> bytes:
         """A copy of something that may hold the layers, in which what is known is kept as it is."""

@@ -284,15 +284,12 @@ class Search:
         if not (isinstance(returned, tuple) and len(returned) == 5):
             raise self.refusal(f"step() returns {on_a_line(returned)}, as in the old Gym: {GYMNASIUM}")
         observation, reward, terminated, truncated, _ = returned
-        if np.ndim(reward):
-            shape = f"an array of shape {np.shape(reward)}; must be a number"
-            raise self.refusal(f"a step with action {action} pays {shape}")
         try:
-            paid = float(reward)
+            paid = math.nan if np.ndim(reward) else float(reward)
         except (TypeError, ValueError):
             paid = math.nan
         if not math.isfinite(paid):
-            number = f"{on_a_line(reward)}; must be a finite number"
+            number = f"{on_a_line(reward)}; must be a finite number, and no array"
             raise self.refusal(f"a step with action {action} pays {number}")
         is_over = bool(terminated or truncated)
         return *self.state_after(observation, depth + 1, is_over), paid, bool(terminated), bool(truncated)
@@ -390,31 +387,23 @@ class Search:
         if self._read is not None:
             key = pickle.dumps(self._read(self.layers.base))
         else:
-            key = self._copied(self.ignore)
+            key = self.layers.take(self.ignore)
         short = hashlib.blake2b(key, digest_size=16).digest()
         if is_over:
             is_new = short not in self._ended and (short, 0) not in self._states
             if is_new and self.branching.sampling is None:
                 self._ended.add(short)
                 if self._read is None or not len(self._ended) % SAMPLED:  # by the user's word it is all alike
-                    self._waiting_ends.append(self._copied())
+                    self._waiting_ends.append(self.layers.take())
             return OVER, seen
         time = depth if self.layers.clocks else 0
         if (state := self._states.get((short, time))) is None:
-            copy = self._copied() if self.ignore or self._read else key
+            copy = self.layers.take() if self.ignore or self._read else key
             like = State(0, 0, copy, short, *known.place_of(self.layers.base))
             if self.layers.clocks:  # one copy for all times
                 like = self._cores.setdefault(short, like)
             state = self._added(like, depth, len(copy) if like.copy is copy else 0)
         return state.number, seen
-
-    def _copied(self, without: Sequence[str] = ()) -> bytes:
-        try:
-            return self.layers.take(without)
-        except (Changed, InputError):
-            raise
-        except Exception as error:  # whatever the classes in it raise
-            raise self.refusal(f"its state cannot be copied: {in_short(error)}") from error
 
     def _added(self, like: State, depth: int, num_bytes: int = 0) -> State:
         """A new state, which is like another but for its time."""

@@ -587,7 +587,7 @@ class Endless(Line):
 
 REFUSED: dict[str, tuple[Any, str]] = {
     "an int that is not an int": (IntOnly, "an action that is an int in another way than np.int64"),
-    "a reward with a shape": (Shaped, r"pays an array of shape \(1,\)"),
+    "a reward with a shape": (Shaped, r"pays \[.*\]; must be a finite number, and no array"),
     "a reset of the old Gym": (
         OldReset,
         r"reset\(\) returns 0, as in the old Gym: .* must return \(observation",
