@@ -245,5 +245,5 @@ def jobs(page: str, libraries: list[str], algorithms: list[str], worlds: list[st
         for algorithm in algorithms
         for library in libraries
         if algorithm in LIBRARIES[library].algorithms.split()
-        if page == "implementations" or library in ("sb3", "sbx", "cleanrl")
+        if page == "implementations" or library in ("sb3", "engine", "sbx", "cleanrl")
     ]
