@@ -202,7 +202,8 @@ def traits(env: Env) -> Any:
     constant: dict[Any, Any] = {
         key: held[key] if isinstance(held[key], gym.Space | EnvSpec) else value
         for key, value in before.items()
-        if key[1] != "env" and after.get(key) == value and held[key] is not branching
+        # Gymnasium's wrappers keep a spec once they were asked for it.
+        if key[1] not in ("env", "_cached_spec") and after.get(key) == value and held[key] is not branching
     }
     return [type(each) for each in search.layers.layers], constant, shown
 
