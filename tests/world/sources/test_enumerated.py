@@ -12,8 +12,10 @@ import torch
 from gymnasium import spaces
 
 from gridworld.base.errors import InputError
+from gridworld.world.door.world import enumerated
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
+from gridworld.world.sources import environment
 from gridworld.world.sources.environment import compile_id
 
 CELLS = 5
@@ -416,3 +418,13 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "minigrid", None)
     with pytest.raises(InputError, match=r"needs the package minigrid; install it with pip install"):
         compile_id(MINIGRID)
+
+
+@pytest.mark.parametrize("env_id", ["Corridor-v0", "ShortCorridor-v0", "DoubledCorridor-v0", "FrozenLake-v1"])
+def test_what_is_made_the_same_each_time_is_enumerated_once(
+    env_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[int] = []
+    monkeypatch.setattr(environment, "enumerated", lambda *a, **k: found.append(0) or enumerated(*a, **k))
+    compile_id(env_id, by_table=False)
+    assert len(found) == 1
