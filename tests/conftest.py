@@ -78,16 +78,18 @@ IN_TURN = {
 }
 # What takes more than ten seconds of a processor, the longest first.
 LONG = (
-    *("clusters", "tests/test_docs.py", "sources/test_chance.py", "commands/test_hostile_runs.py"),
-    *("course/test_course.py", "checking/test_functions.py", "docs/test_examples.py"),
-    *("diagnosis/test_sabotage.py", "api/test_certificates.py", "config/test_recipe_rule.py"),
+    *("clusters", "tests/test_docs.py", "commands/test_settings_of_strangers.py", "api/test_certificates.py"),
+    *("docs/test_atlas.py", "commands/test_hostile_runs.py", "checking/test_functions.py"),
+    *("course/test_course.py", "commands/test_own_environments.py", "docs/test_examples.py"),
+    *("diagnosis/test_sabotage.py", "door/test_sixty_environments.py", "config/test_recipe_rule.py"),
+    *("door/test_door.py", "world/test_solver.py", "api/test_worlds.py", "commands/test_play.py"),
     *("sweep/test_sweep_population.py", "sweep/test_sweep.py", "sources/test_enumerated.py"),
     *("tune/test_tune.py", "browsers", "playground", "config/test_recipes.py", "tune/test_tune_parts.py"),
     "engine/test_populations.py",
     *("report/test_report.py", "config/test_config.py", "commands/test_bad_input.py"),
     *("commands/test_commands.py", "process/test_output.py"),
     *("restore/test_reproduce.py", "restore/test_resume.py", "checking/test_check.py"),
-    *("examining/test_examine.py", "api/test_worlds.py", "restore/test_resume_commands.py"),
+    *("examining/test_examine.py", "restore/test_resume_commands.py", "sources/test_chance.py"),
     "commands/test_train_on_worlds.py",
     *("export/test_export.py", "training/test_training.py"),
     *("agents/sb3/test_custom_code.py", "engine/test_updates.py", "restore/test_resume_states.py"),

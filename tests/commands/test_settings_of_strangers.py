@@ -1,8 +1,8 @@
 """Whatever a stranger writes into a setting, no door to a run imports it or contacts a server.
 
 Every text of every schema is in turn the path of a module that leaves a mark where it is imported, and so
-does the package of the server. What needs trust somewhere is tried alone, in its first form at every door and
-in others at two, and all else together.
+does the package of the server. What needs trust somewhere is tried alone, in one run at every door in its
+first form, else at two, and all else together.
 """
 
 import contextlib
@@ -166,7 +166,8 @@ def test_no_door_runs_what_a_stranger_names(agent: str, source: str | None, good
     tried = set[str]()  # settings, at every door
     for name, value in texts(content):
         is_readable, is_harmful = edited(run, like, *world, (name, value)), any(foreign({name: value}))
-        doors = DOORS if is_readable and is_harmful and name not in tried else TWO if is_readable else TWO[:1]
+        is_first = is_harmful and name not in tried and agent in ("dqn", "map")
+        doors = (DOORS if is_first else TWO) if is_readable else TWO[:1]
         if doors is DOORS:
             tried.add(name)
         refused = [ends(door, run, mark, (name, value)) for door in doors]

@@ -200,8 +200,8 @@ def test_stable_baselines3_and_the_engine(
     again = atlas.rows.read(path)
     assert [row._replace(seconds=0) for row in again] == [row._replace(seconds=0) for row in found]
     capsys.readouterr()
-    atlas.main(["--rows", str(path), "repeat", "--seeds", "2"])
-    assert capsys.readouterr().out.count(": the same\n") == 2
+    atlas.main(["--rows", str(path), "repeat", "--seeds", "1"])
+    assert capsys.readouterr().out.count(": the same\n") == 1
 
 
 @pytest.mark.slow

@@ -153,7 +153,7 @@ def test_a_world_of_200_by_200_cells_fits_into_a_gigabyte():
 
 @pytest.mark.slow
 def test_many_states_are_solved_in_the_farthest_cell_too():
-    side, slip = 601, 0.1
+    side, slip = 401, 0.1
     mdp = compile_mdp(Layout("open", side, side, starts=((0, 0),), goals=((side // 2, side - 1),)), slip=slip)
     solution = solve.value_iteration(mdp, 0.99)
     q = np.zeros((side * side, 4))  # Bellman's equation, from the tables
@@ -162,8 +162,8 @@ def test_many_states_are_solved_in_the_farthest_cell_too():
         q += mdp.probability[:, :, outcome] * (mdp.reward[:, :, outcome] + 0.99 * there)
     q[mdp.terminal] = 0
     assert q.max(axis=1) == pytest.approx(solution.v, rel=1e-12, abs=0)
-    assert 0 < solution.v[0] < 1e-3
-    above, below = (solution.v.reshape(side, side)[half] for half in (slice(301), slice(300, side)))
+    assert 0 < solution.v[0] < 1e-2
+    above, below = (solution.v.reshape(side, side)[half] for half in (slice(201), slice(200, side)))
     assert above[::-1] == pytest.approx(below, rel=1e-9)  # mirrored at the goal's row
 
 
@@ -214,9 +214,9 @@ def test_what_is_no_policy_is_refused(row):
 @pytest.mark.slow
 def test_a_value_may_fade_to_nothing_on_the_way() -> None:
     """The smallest float times 0.9 is itself again: no policy should be improved for its sake."""
-    best = solve.value_iteration(compile_mdp(parse("S" + "." * 9000 + "G", "corridor")), 0.9)
-    distance = 9000 - np.arange(6000, 9001)
-    assert best.v[6000:9001] == pytest.approx(0.9**distance, rel=1e-9)
+    best = solve.value_iteration(compile_mdp(parse("S" + "." * 7600 + "G", "corridor")), 0.9)
+    distance = 7600 - np.arange(4600, 7601)
+    assert best.v[4600:7601] == pytest.approx(0.9**distance, rel=1e-9)
     assert best.v[0] == 0
     assert best.optimal[0].all()
-    assert best.optimal[6000:9001].sum() == 3001  # to the right, and nothing else
+    assert best.optimal[4600:7601].sum() == 3001  # to the right, and nothing else
