@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import EnumType
 from functools import partial
+from types import FunctionType
 from typing import Any
 
 import gymnasium as gym
@@ -27,6 +28,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from gridworld.base.user_input import check_memory
+from gridworld.world.door import known
 from gridworld.world.door.attributes import GENERATORS, attributes
 from gridworld.world.door.beliefs import Beliefs, Node, Step
 from gridworld.world.door.budget import MOST_STATES
@@ -185,8 +187,12 @@ def _action_names(search: Search) -> list[str] | None:
     return [names[number] for number in numbers] if names.keys() >= set(numbers) else None
 
 
-def traits(env: Env) -> Any:
-    """What two environments that are one task have in common: a walk, and what never changes."""
+# The environment below; what was kept of its spec once somebody asked; the seed of a generator without one.
+_OF_GYMNASIUM = ("env", "_cached_spec", "_np_random_seed")
+
+
+def traits(env: Env) -> tuple[list[type], dict[Any, Any], list[Any]]:
+    """What two environments that are one task have in common: classes, what never changes, and a walk."""
     search = Search("env", env)
     search.branching = branching = Rejecting("env", lambda: (b"", True), ())
     search.layers = Layers("env", env, branching, keeps_views=True)
@@ -199,13 +205,22 @@ def traits(env: Env) -> Any:
         before = search.layers.values()
         shown = walk(search, np.int64)
         after = search.layers.values()
-    constant: dict[Any, Any] = {
-        key: held[key] if isinstance(held[key], gym.Space | EnvSpec) else value
+    constant = {
+        key: _lasting(held[key], value)
         for key, value in before.items()
-        # Gymnasium's wrappers keep a spec once they were asked for it.
-        if key[1] not in ("env", "_cached_spec") and after.get(key) == value and held[key] is not branching
+        if key[1] not in _OF_GYMNASIUM and after.get(key) == value and held[key] is not branching
     }
     return [type(each) for each in search.layers.layers], constant, shown
+
+
+def _lasting(held: Any, copy: bytes) -> Any:
+    """What an attribute holds, to be compared with another environment's."""
+    if isinstance(held, gym.Space | EnvSpec):
+        return held
+    if known.is_kept(type(held)):
+        return type(held)
+    is_plain = isinstance(held, FunctionType) and held.__closure__ is None
+    return (held.__code__, held.__defaults__) if is_plain else copy
 
 
 def contents(env: Env) -> dict[str, bytes]:

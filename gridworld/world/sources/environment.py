@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from functools import partial
@@ -20,13 +21,14 @@ from gymnasium.utils import seeding
 from gridworld.base.errors import OLD_GYM, InputError, in_short, install_command
 from gridworld.base.user_input import named_object
 from gridworld.world.door import known
-from gridworld.world.door.attributes import layers_of, random_states, state_of
+from gridworld.world.door.attributes import differing, layers_of, random_states, state_of
 from gridworld.world.door.layers import Env
 from gridworld.world.door.world import Found, enumerated, traits
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources.gymnasium_table import compile_table, has_table
 
 _IF_DRAWN, _OTHERS = 40, 8  # instances that are compared, if making one is seen to draw, and otherwise
+_EACH = 2  # of those that differ in the same attributes, and not in a walk, so many are enumerated
 
 
 def compile_id(
@@ -77,10 +79,15 @@ def found_by(make: Callable[[], Env], where: str = "env", name: str = "", **boun
     with closing(make()) as env:
         is_drawn = random_states() != before or _has_drawn(env)
         found, own = enumerated(where, env, name=name, **bounds), traits(env)
+    met = Counter[tuple[Any, ...]]()  # how often others differed in what
     for _ in range(_IF_DRAWN if is_drawn else _OTHERS):
         with closing(make()) as again:
-            if traits(again) == own:
+            classes, constant, walked = traits(again)
+            names = tuple(differing(own[1], constant))
+            is_alike = (classes, walked) == (own[0], own[2])
+            if is_alike and (not names or met[names] == _EACH):
                 continue
+            met[names] += 1
             other = enumerated(where, again, name=name, **bounds)
             if other.mdp.shown_digest() != found.mdp.shown_digest():
                 raise InputError(

@@ -1,12 +1,16 @@
 """Deterministic environments become tables; whatever is not deterministic is refused with a reason."""
 
+import itertools
 import random
 import threading
+import uuid
 from collections import deque
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pygame
 import pytest
 import torch
 from gymnasium import spaces
@@ -428,3 +432,44 @@ def test_what_is_made_the_same_each_time_is_enumerated_once(
     monkeypatch.setattr(environment, "enumerated", lambda *a, **k: found.append(0) or enumerated(*a, **k))
     compile_id(env_id, by_table=False)
     assert len(found) == 1
+
+
+MADE: dict[str, tuple[Any, int]] = {  # what an instance holds of its own, and how often it is enumerated
+    "a clock": (lambda env: pygame.time.Clock(), 1),
+    "a function": (lambda env: lambda cell: cell + 1, 1),
+    "a generator": (lambda env: env.np_random, 1),
+    "a name": (lambda env: uuid.uuid4().hex, 3),
+    "a function of a number": (lambda env: partial(max, uuid.uuid4().int), 3),
+}
+
+
+@pytest.mark.parametrize("what", MADE)
+def test_what_instances_have_of_their_own_is_looked_at_a_few_times(
+    what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held, expected = MADE[what]
+    found: list[int] = []
+    monkeypatch.setattr(environment, "enumerated", lambda *a, **k: found.append(0) or enumerated(*a, **k))
+
+    def made() -> Any:
+        env = Corridor()
+        env.own = held(env)  # type: ignore[attr-defined]
+        return gym.wrappers.TimeLimit(env, 20)
+
+    assert environment.found_by(made).mdp.num_states == CELLS
+    assert len(found) == expected
+
+    class Ends(Corridor):
+        def step(self, action: int) -> Any:
+            shown, reward, over, *rest = super().step(action)
+            return shown, reward * self.end, over, *rest  # type: ignore[attr-defined]
+
+    numbers = itertools.count()
+
+    def drawn() -> Any:
+        env = Ends()
+        env.own, env.end = held(env), int(next(numbers) == 7)  # type: ignore[attr-defined]
+        return env
+
+    with pytest.raises(InputError, match="is another world each time it is made"):
+        environment.found_by(drawn)
