@@ -99,7 +99,7 @@ def equivalence(one: np.ndarray, other: np.ndarray) -> tuple[statistics.Interval
 def caution(found: Sequence[Group]) -> str:
     """How much so many seeds allow to say."""
     counts = sorted(len(group.rows) for group in found) or [0]
-    number = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1])))) + " seeds"
+    number = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1])))) + f" seed{'s' * (counts[-1] != 1)}"
     return f"**{number}{': a smoke test, no claim' if counts[0] < _FEW else ''}.**"
 
 
