@@ -82,9 +82,11 @@ def _by_states(seen: Seen) -> tuple[str, str] | None:
     search = Search("env", env, **bounds, compares=False, keeps_copies=True)
     try:
         search.explore()
+    except TooLargeError:
+        if not search.num_tried:
+            return None
     except Exception:  # its code may be anybody's
-        if not getattr(search, "states", None):
-            return None  # nothing was tried
+        return None
     known = (counted(search), seen.ends_at and seen.ends_at - 1, len(search.states))
     limit = min(each for each in known if each is not None)
     states = [each for each in search.states if each.steps and each.depth < limit]
@@ -211,7 +213,7 @@ def _by_conflict(seen: Seen) -> tuple[str, str] | None:
         return None
     cause, histories = _PAST, _histories(steps.time, pair)
     by = {_TIME: steps.time, _RESET: steps.episode, _BEFORE: previous}
-    if seen.replays.plays and all(each[0] == seen.replays.plays[0][0] for each in seen.replays.plays):
+    if seen.replays.plays and all(each == seen.replays.plays[0] for each in seen.replays.plays):
         del by[_RESET]  # other seeds change nothing
     elif _several(histories, outcome).any():
         cause, by = _RESET, {}  # all that could be seen was the same

@@ -51,6 +51,7 @@ _WATCHED = 300  # first steps, in which returned arrays and generators are watch
 _MOST_NUMBERS = 256  # of an observation; more, as of an image, are not looked at
 _SECONDS = 15.0  # for the sample
 _REPLAYED = 10.0  # seconds, for the replays; fewer steps where that is not enough
+_MOST_SEEDS, _DOUBTED = 60, 2.0  # of replays, and more seconds, while no action does anything
 _ENDED, _TRIES = 3.0, 20  # seconds and episodes, for those that end as some of the sample did
 _ITS = "its generator"
 
@@ -236,8 +237,15 @@ def replays(make: Callable[[], Env], actions: Actions, sampled: Steps, rate: flo
         _try_ends(found, make, sampled, _ENDED * rate, (lists[0], base[0][0]))
     found.repeats = base == again == new and not found.causes and not found.survivors
     if base == new:
-        held_plays = plays(make(), [[action] * steps for action in actions.pool])
-        found.plays = [one + two for one, two in zip(base, held_plays, strict=True)]
+        held = [[action] * steps for action in actions.pool]
+        found.plays = [one + two for one, two in zip(base, plays(make(), held), strict=True)]
+        env, until = make(), time.monotonic() + _DOUBTED
+        while (
+            all(play == each[0] for each in found.plays for play in each)
+            and len(found.plays) < _MOST_SEEDS
+            and time.monotonic() < until
+        ):
+            found.plays.append([_play(env, each, len(found.plays), drawn) for each in [*lists, *held]])
     return found
 
 

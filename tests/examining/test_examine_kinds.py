@@ -603,6 +603,24 @@ def test_actions_are_not_the_draws_of_the_environment(actions: Any) -> None:
     assert steps.reward[:500].mean() == pytest.approx(0.5, abs=0.1)
 
 
+class Guess(Pennies):
+    """A step pays 1 if the action is the first of nine hidden digits, which rarely is 0 or 1."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Start:
+        super().reset(seed=seed)
+        self.digits = self.np_random.integers(20, size=9)
+        return 0, {}
+
+    def step(self, action: Any) -> Result:
+        return 0, float(action == self.digits[0]), True, False, {}
+
+
+def test_an_action_that_rarely_matters_is_not_said_to_do_nothing() -> None:
+    result = examine(lambda: Guess(Discrete(2)), steps=STEPS)
+    assert result.topics == ["markov"]
+    assert "depend on what is drawn at reset, which is not observed" in evidence(result, "markov")
+
+
 class HiddenSide(gym.Env[Any, Any]):
     """Begins in the middle of a row with slippery cells, with the goal at an end: it shows its place only."""
 

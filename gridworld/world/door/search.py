@@ -106,6 +106,7 @@ class Search:
         self.seen = Seen(env, self.refusal)
         self.is_cutting = False  # whether steps are tried as they are at a limit
         self.limit_met: int | None = None  # the time at which it cuts episodes, where the time is no state
+        self.num_tried = 0
         self.budget = Budget(self, most_states, most_seconds)
 
     def refusal(self, reason: str) -> InputError:
