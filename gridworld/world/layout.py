@@ -130,6 +130,7 @@ def parse(text: str, name: str, rewards: Mapping[str, float] | None = None) -> L
     paid = _paid(name, lines.pop(0) if "=" in lines[0] else "", rewards or {})
     if not lines:
         raise InputError(f"{name}: there is no map below the rewards of its ends")
+    _check_size(name, len(lines), len(lines[0]))  # before there is an object for each cell
     found: dict[str, list[Cell]] = {tile: [] for tile in [*_TILES, *paid]}
     for row, line in enumerate(lines):
         for col, tile in enumerate(line):
@@ -234,15 +235,20 @@ def _read(layout: str | PathLike[str], rewards: Mapping[str, float] | None) -> L
         raise InputError(f"{name}: not a text file (byte {error.start + 1} is not UTF-8)") from None
 
 
+def _check_size(name: str, num_rows: int, num_cols: int) -> None:
+    if num_rows * num_cols > MAX_CELLS:
+        raise InputError(
+            f"{name}: {num_rows} rows of {num_cols} columns are too large; at most {MAX_CELLS} cells fit"
+        )
+
+
 def _check(layout: Layout) -> None:
     def refused(mistake: str, remedy: str) -> InputError:
         return InputError(f"{layout.name}: {mistake}; {remedy}")
 
     positive_int("num_rows", layout.num_rows)
     positive_int("num_cols", layout.num_cols)
-    if layout.num_rows * layout.num_cols > MAX_CELLS:
-        size = f"{layout.num_rows} rows of {layout.num_cols} columns are too large"
-        raise refused(size, f"at most {MAX_CELLS} cells fit")
+    _check_size(layout.name, layout.num_rows, layout.num_cols)
     for what in ("start", "goal"):
         if not getattr(layout, f"{what}s"):
             raise refused(f"there is no {what}", f"mark at least one cell with {what[0].upper()!r}")
