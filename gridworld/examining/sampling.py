@@ -76,7 +76,8 @@ class Steps:
     failure: str  # what a step raised, if one did
     mistyped: str  # what is wrong with the type of a flag
     acts: list[Any]  # the actions by their numbers
-    pixels: dict[str, set[int]]  # the numbers in observations that SB3 takes for images, by their names
+    # Of observations that SB3 takes for images, by their names, the largest numbers, also below 255.
+    pixels: dict[str, set[int]]
 
     @property
     def last(self) -> IntArray:
@@ -99,6 +100,11 @@ class Replays:
     after: str = "other"  # the episodes after which it does not
     shared: list[str] = field(default_factory=list)  # attributes that another environment changes
     plays: list[list[Play]] = field(default_factory=list)
+
+    @property
+    def does_nothing(self) -> bool:
+        """Whether no action does anything: with each seed, all plays are the same."""
+        return bool(self.plays) and all(play == each[0] for each in self.plays for play in each)
 
 
 class Actions:
@@ -166,7 +172,8 @@ def sample(env: Env, actions: Actions, most: int, seed: int) -> Steps:
             vectors.append(_vector(parts))
             for name, space, part in parts:
                 if is_image(space) and isinstance(part, np.ndarray):
-                    pixels.setdefault(name, set()).update(np.unique(part).tolist())
+                    lower = np.max(part, initial=0, where=part < 255)
+                    pixels.setdefault(name, set()).update((int(lower), int(np.max(part, initial=0))))
         return numbers[key]
 
     while len(rows) < most and time.monotonic() < until and not failure:
@@ -240,11 +247,7 @@ def replays(make: Callable[[], Env], actions: Actions, sampled: Steps, rate: flo
         held = [[action] * steps for action in actions.pool]
         found.plays = [one + two for one, two in zip(base, plays(make(), held), strict=True)]
         env, until = make(), time.monotonic() + _DOUBTED
-        while (
-            all(play == each[0] for each in found.plays for play in each)
-            and len(found.plays) < _MOST_SEEDS
-            and time.monotonic() < until
-        ):
+        while found.does_nothing and len(found.plays) < _MOST_SEEDS and time.monotonic() < until:
             found.plays.append([_play(env, each, len(found.plays), drawn) for each in [*lists, *held]])
     return found
 

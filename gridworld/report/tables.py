@@ -261,10 +261,8 @@ def runs_table(report: Report) -> Table:
     """A row for each run that is counted."""
     rows: list[list[Cell]] = []
     for group, run in report.study.runs:
-        certified, steps = (
-            "yes" if run.certified else "no",
-            (run.certified_since_step, run.first_certified_step),
-        )
+        certified = "yes" if run.certified else "no"
+        steps = run.certified_since_step, run.first_certified_step
         rows.append([group.task, group.agent, run.recipe or NOTHING, run.seed, certified, run.regret])
         rows[-1] += [run.proven_regret, *(int(step) if math.isfinite(step) else None for step in steps)]
         rows[-1] += [run.steps, run.seconds, str(run.folder)]

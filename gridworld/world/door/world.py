@@ -28,13 +28,12 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from gridworld.base.user_input import check_memory
-from gridworld.world.door import known
 from gridworld.world.door.attributes import GENERATORS, attributes
 from gridworld.world.door.beliefs import Beliefs, Node, Step
 from gridworld.world.door.budget import MOST_STATES
 from gridworld.world.door.checks import walk
 from gridworld.world.door.counters import limit_of
-from gridworld.world.door.known import Named
+from gridworld.world.door.known import Named, is_kept
 from gridworld.world.door.layers import KEPT, Env, Layers
 from gridworld.world.door.rejection import Rejecting
 from gridworld.world.door.search import Search, State
@@ -217,7 +216,7 @@ def _lasting(held: Any, copy: bytes) -> Any:
     """What an attribute holds, to be compared with another environment's."""
     if isinstance(held, gym.Space | EnvSpec):
         return held
-    if known.is_kept(type(held)):
+    if is_kept(type(held)):
         return type(held)
     is_plain = isinstance(held, FunctionType) and held.__closure__ is None
     return (held.__code__, held.__defaults__) if is_plain else copy

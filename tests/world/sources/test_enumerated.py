@@ -424,14 +424,18 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         compile_id(MINIGRID)
 
 
-@pytest.mark.parametrize("env_id", ["Corridor-v0", "ShortCorridor-v0", "DoubledCorridor-v0", "FrozenLake-v1"])
-def test_what_is_made_the_same_each_time_is_enumerated_once(
-    env_id: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def enumerations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """An entry for each time that an environment is enumerated."""
     found: list[int] = []
     monkeypatch.setattr(environment, "enumerated", lambda *a, **k: found.append(0) or enumerated(*a, **k))
+    return found
+
+
+@pytest.mark.parametrize("env_id", ["Corridor-v0", "ShortCorridor-v0", "DoubledCorridor-v0", "FrozenLake-v1"])
+def test_what_is_made_the_same_each_time_is_enumerated_once(env_id: str, enumerations: list[int]) -> None:
     compile_id(env_id, by_table=False)
-    assert len(found) == 1
+    assert len(enumerations) == 1
 
 
 MADE: dict[str, tuple[Any, int]] = {  # what an instance holds of its own, and how often it is enumerated
@@ -445,11 +449,9 @@ MADE: dict[str, tuple[Any, int]] = {  # what an instance holds of its own, and h
 
 @pytest.mark.parametrize("what", MADE)
 def test_what_instances_have_of_their_own_is_looked_at_a_few_times(
-    what: str, monkeypatch: pytest.MonkeyPatch
+    what: str, enumerations: list[int]
 ) -> None:
     held, expected = MADE[what]
-    found: list[int] = []
-    monkeypatch.setattr(environment, "enumerated", lambda *a, **k: found.append(0) or enumerated(*a, **k))
 
     def made() -> Any:
         env = Corridor()
@@ -457,7 +459,7 @@ def test_what_instances_have_of_their_own_is_looked_at_a_few_times(
         return gym.wrappers.TimeLimit(env, 20)
 
     assert environment.found_by(made).mdp.num_states == CELLS
-    assert len(found) == expected
+    assert len(enumerations) == expected
 
     class Ends(Corridor):
         def step(self, action: int) -> Any:
