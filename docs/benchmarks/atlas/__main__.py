@@ -63,7 +63,7 @@ def main(words: list[str]) -> None:
 def check(job: plan.Job) -> None:
     """Train shortly, save, load and play FrozenLake-v1 as Gymnasium has it, against the exact return."""
     last, name = {}, f"{job.library} {job.algorithm}"
-    for line in rows.work(job, steps=10_240, play={"id": "FrozenLake-v1", "episodes": 2000}):
+    for line in rows.work([job], steps=10_240, play={"id": "FrozenLake-v1", "episodes": 2000}):
         last |= line
     if "played" not in last:
         print(f"{name}: saves no model of its own")
@@ -79,7 +79,7 @@ def repeat(found: list[rows.Row], count: int) -> None:
     pairs = [(row, plan.Job(*row[:3], w, int(row.seed))) for row in found for w in plan.worlds_of(row.page)]
     known = [(row, job) for row, job in pairs if job.key == row[: plan.KEY]]
     for row, job in random.sample(known, min(count, len(known))):
-        again = rows.run(job)
+        [again] = rows.run([job])
         if again._replace(seconds=row.seconds) != row:
             raise InputError(f"repeat: the row is {row}\nand now {again}")
         print(f"{' '.join(row[:5])}: the same", flush=True)

@@ -27,7 +27,7 @@ class Reader:
     """Counts the steps of all environments together, and writes the policy when it is due."""
 
     def __init__(self, job: dict[str, Any], out: Any) -> None:
-        self._every, self._steps, self._out = job["every"], job["steps"], out
+        self._every, self._steps, self._out, self.seed = job["every"], job["steps"], out, job["seeds"][0]
         self.rows = np.array(job["world"]["observation"], dtype=np.float32)
         self.count = 0
         self.greedy: Greedy | None = None  # set by an adapter, before the first step
@@ -45,7 +45,7 @@ class Reader:
             self.write(step=self.count, actions=np.asarray(self.greedy(self.rows)).reshape(-1).tolist())
 
     def write(self, **line: Any) -> None:
-        print(json.dumps(line), file=self._out, flush=True)
+        print(json.dumps({"seed": self.seed, **line}), file=self._out, flush=True)
 
 
 class TableEnv(gym.Env):
@@ -74,11 +74,11 @@ class TableEnv(gym.Env):
 
 def plain(job: dict[str, Any], reader: Reader) -> None:
     """The textbook's Q-learning (Sutton and Barto, 2nd ed., section 6.5) in one environment."""
-    s, rng, env = job["settings"], np.random.default_rng(job["seed"]), gym.make("Atlas-v0")
+    s, rng, env = job["settings"], np.random.default_rng(reader.seed), gym.make("Atlas-v0")
     q = np.full((reader.rows.shape[1], int(env.action_space.n)), s["initial_value"])
     reader.greedy = lambda rows: q[rows.argmax(axis=1)].argmax(axis=1)
     first, last = s["exploration_initial_eps"], s["exploration_final_eps"]
-    state = env.reset(seed=job["seed"])[0].argmax()
+    state = env.reset(seed=reader.seed)[0].argmax()
     for step in range(job["steps"]):
         epsilon = first + min(step / job["steps"] / s["exploration_fraction"], 1.0) * (last - first)
         greedy = rng.choice(np.flatnonzero(q[state] == q[state].max()))
@@ -97,7 +97,7 @@ def sb3_like(job: dict[str, Any], reader: Reader) -> Saved:
     module = importlib.import_module({"sb3": "stable_baselines3", "sbx": "sbx"}[job["library"]])
     kind, settings = getattr(module, job["algorithm"].upper()), job["settings"]
     envs = make_vec_env("Atlas-v0", n_envs=settings.pop("n_envs", 1))
-    model = kind("MlpPolicy", envs, seed=job["seed"], device="cpu", **settings)
+    model = kind("MlpPolicy", envs, seed=reader.seed, device="cpu", **settings)
 
     def greedy_of(some: Any) -> Greedy:
         return lambda rows: some.predict(rows, deterministic=True)[0]
@@ -113,7 +113,7 @@ def cleanrl(job: dict[str, Any], reader: Reader) -> Saved:
 
     source = Path(job["room"], "cleanrl", "source")
     script, change = source / "cleanrl" / f"{job['algorithm']}.py", job["settings"].pop("change", ("", ""))
-    fixed = {"env_id": "Atlas-v0", "seed": job["seed"], "total_timesteps": job["steps"], "cuda": False}
+    fixed = {"env_id": "Atlas-v0", "seed": reader.seed, "total_timesteps": job["steps"], "cuda": False}
     sys.argv = [script.name]
     for name, value in {**fixed, **job["settings"]}.items():
         word = name.replace("_", "-")
@@ -141,15 +141,17 @@ def cleanrl(job: dict[str, Any], reader: Reader) -> Saved:
 
 
 def engine(job: dict[str, Any], reader: Reader) -> None:
-    """This package: its learning curve is exact already."""
+    """This package, all seeds as one population: its learning curve is exact already."""
     import gridworld
 
-    length = [f"total_timesteps={job['steps']}", f"evaluation.every={job['every']}"]
-    run = gridworld.train(*job["words"], *length, seed=job["seed"], progress=False)
-    for step, regret, certified in zip(*map(run.curve.get, ("step", "regret", "certified")), strict=True):
-        reader.write(step=int(step), regret=float(regret), certified=bool(certified))
-    if job.get("diagnose") and not run.summary["certified"]:
-        reader.write(cause=gridworld.diagnose(run).cause)
+    words = [*job["words"], f"total_timesteps={job['steps']}", f"evaluation.every={job['every']}"]
+    sweep = gridworld.sweep(*words, "hydra.launcher.n_jobs=1", seed=job["seeds"], progress=False)
+    for run in sweep.runs:
+        reader.seed = run.summary["seed"]
+        for step, regret, certified in zip(*map(run.curve.get, ("step", "regret", "certified")), strict=True):
+            reader.write(step=int(step), regret=float(regret), certified=bool(certified))
+        if job.get("diagnose") and not run.summary["certified"]:
+            reader.write(cause=gridworld.diagnose(run).cause)
 
 
 def play(what: dict[str, Any], greedy: Greedy) -> dict[str, float]:

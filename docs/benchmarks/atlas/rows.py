@@ -33,7 +33,7 @@ class Row(NamedTuple):
     versions: str
     done: int  # environment steps
     every: int
-    seconds: float  # until the worker has ended
+    seconds: float  # until the worker has ended, a run
     certified_since: str  # the first evaluation after which no later one fails; "" where the last one does
     regret: float  # of the last policy
     cause: str  # why it is not certified, where `diagnose` was asked
@@ -69,9 +69,10 @@ def append(path: Path, row: Row) -> None:
         csv.writer(file, lineterminator="\n").writerows(lines)
 
 
-def work(job: Job, **more: Any) -> list[dict[str, Any]]:
-    """The lines that a worker writes for a job; those with actions have their exact `score`."""
-    task = {**job.content, "seed": job.seed, "world": job.world.tables, "room": str(ROOM), **more}
+def work(jobs: list[Job], **more: Any) -> list[dict[str, Any]]:
+    """The lines that a worker writes for jobs that differ in their seeds; those with actions have a `score`."""
+    job, seeds = jobs[0], [each.seed for each in jobs]
+    task = {**job.content, "seeds": seeds, "world": job.world.tables, "room": str(ROOM), **more}
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore", "PYTHONPATH": str(ROOT)}
     command = [str(python_of(job.library)), str(Path(__file__).with_name("adapters.py"))]
     done = subprocess.run(command, input=json.dumps(task), capture_output=True, text=True, env=environment)
@@ -89,17 +90,24 @@ def work(job: Job, **more: Any) -> list[dict[str, Any]]:
     return lines
 
 
-def run(job: Job) -> Row:
-    """Train a job, and make a row of it."""
-    curve, since, before, last, started = [], "", "", {"cause": ""}, time.perf_counter()
-    for line in work(job):
+def run(jobs: list[Job]) -> list[Row]:
+    """Train jobs that differ in their seeds, and make a row of each."""
+    started = time.perf_counter()
+    lines = work(jobs)
+    seconds = round((time.perf_counter() - started) / len(jobs), 1)
+    return [_row(job, [line for line in lines if line["seed"] == job.seed], seconds) for job in jobs]
+
+
+def _row(job: Job, lines: list[dict[str, Any]], seconds: float) -> Row:
+    curve, since, before, last = [], "", "", {"cause": ""}
+    for line in lines:
         last |= line
         if "regret" in line:
             since = (since or str(line["step"])) if line["certified"] else ""
             text = "0*" if line["certified"] else f"{line['regret']:.9g}"
             curve += [f"{line['step']}:{text}"] if text != before else []
             before = text
-    seconds, regret = round(time.perf_counter() - started, 1), float(before.rstrip("*"))
+    regret = float(before.rstrip("*"))
     rest = last["step"], job.content["every"], seconds, since, regret, last["cause"], " ".join(curve)
     return Row(*job.key, *rest)
 
@@ -117,18 +125,21 @@ def estimate(jobs: list[Job], path: Path, processes: int) -> str:
 
 
 def run_all(jobs: list[Job], path: Path, processes: int) -> list[str]:
-    """Run jobs, so many at once; returns what failed."""
-    failed = []
+    """Run jobs, so many processes at once, the engine's seeds as one population; returns what failed."""
+    failed, count, batches = [], 0, defaultdict(list)
+    for job in jobs:
+        batches[job.key[:4], None if job.library == "engine" else job.seed].append(job)
     with ThreadPoolExecutor(processes) as pool:
-        futures = [pool.submit(run, job) for job in jobs]
+        futures = [pool.submit(run, batch) for batch in batches.values()]
         try:
-            for count, future in enumerate(as_completed(futures), 1):
+            for future in as_completed(futures):
                 if isinstance(error := future.exception(), InputError):
                     failed.append(str(error))
                     continue
-                append(path, row := future.result())
-                end = f"certified since {row.certified_since}" if row.certified_since else "not certified"
-                print(f"{count}/{len(jobs)} {' '.join(row[1:5])}: {end}, {row.seconds} s", flush=True)
+                for count, row in enumerate(future.result(), count + 1):
+                    append(path, row)
+                    end = f"certified since {row.certified_since}" if row.certified_since else "not certified"
+                    print(f"{count}/{len(jobs)} {' '.join(row[1:5])}: {end}, {row.seconds} s", flush=True)
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
     return failed
