@@ -20,10 +20,10 @@ from scipy.sparse.csgraph import connected_components
 from gridworld.base.errors import TooLargeError
 from gridworld.examining.seen import Seen
 from gridworld.world.door.attributes import differing, held_by, is_plain
-from gridworld.world.door.beliefs import summed
+from gridworld.world.door.beliefs import State, summed
 from gridworld.world.door.counters import counted
 from gridworld.world.door.known import state_reader
-from gridworld.world.door.search import Search, State
+from gridworld.world.door.search import Search
 from gridworld.world.mdp import BoolArray, IntArray, Mdp
 from gridworld.world.shown import content
 

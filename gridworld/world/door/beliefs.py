@@ -50,6 +50,21 @@ class Step(NamedTuple):
     truncated: bool
 
 
+@dataclass
+class State:
+    """A state of the environment itself, which an agent may not see."""
+
+    number: int
+    depth: int  # steps from the start
+    copy: bytes  # b"" where it is no longer needed
+    core: bytes  # a digest of its attributes without clocks
+    name: str
+    place: tuple[str, int, int] | None  # which way the agent faces, row and column
+    is_open: bool = False  # an episode goes on in it
+    steps: Sequence[Sequence[Step]] = ()  # the outcomes of each action; empty where none was tried
+    mask: tuple[bool, ...] | None = None  # which actions `action_masks()` allows
+
+
 def lumped(steps: Sequence[Sequence[Sequence[Step]]], apart: Sequence[Any]) -> list[int]:
     """The number of each hidden state's class: states of one class look and pay alike, whatever is done.
 

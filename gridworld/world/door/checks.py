@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from gridworld.base.errors import InputError
 from gridworld.world.door.attributes import differing, held_by, innermost, is_plain
 from gridworld.world.door.beliefs import Step, summed
 from gridworld.world.door.counters import counted
@@ -23,6 +24,14 @@ from gridworld.world.shown import content
 if TYPE_CHECKING:
     from gridworld.world.door.search import Search
 
+_NOT_REPEATED = (
+    "it does not repeat a walk with the same random numbers, so it depends on more than its attributes and "
+    "np_random: another generator, a clock, a file, something global"
+)
+_INTS = (
+    "it answers an action that is an int in another way than np.int64, which learners send; take both alike, "
+    "e.g. by int(action)"
+)
 _NO_LIMIT = (
     "it truncates some episodes earlier than others, so it has no single step limit; let step() return "
     "terminated=True where something ends an episode, and truncated=True only after a fixed number of steps"
@@ -78,6 +87,25 @@ def _steps(search: Search, kind: type, numbers: np.random.Generator) -> Iterator
         yield search.seen.digest(observation), np.asarray(reward, np.float64).tobytes(), *map(bool, over)
         if any(over):
             return
+
+
+def check_walks(search: Search, shown: list[Any]) -> None:
+    """The walks must show the same again, and with plain ints as actions too."""
+    for kind, mistake in ((np.int64, _NOT_REPEATED), (int, _INTS)):
+        search.layers.put(search.begin)
+        if walk(search, kind) != shown:
+            search.layers.check_generators()
+            raise search.refusal(mistake)
+
+
+def check_ignored(search: Search, first: bytes) -> None:
+    """What `ignore` names must be attributes, at least after a reset from this copy, which may make them."""
+    if not set(search.ignore) <= set(search.layers.names()):
+        search.merged(partial(search.reset_from, first))
+    names = dict.fromkeys(search.layers.names())
+    if unknown := [each for each in search.ignore if each not in names]:
+        has = f"has no attribute {unknown[0]}; it has {', '.join(names)}"
+        raise InputError(f"env.ignore={list(search.ignore)}: {search.where.removeprefix('env.id=')} {has}")
 
 
 def check_by_word(search: Search) -> int | None:

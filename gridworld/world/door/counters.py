@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 from gymnasium.wrappers import TimeLimit
 
-from gridworld.world.door.beliefs import Step, summed
+from gridworld.world.door.beliefs import State, Step, summed
 from gridworld.world.door.uniform import OPERATIONS
 
 if TYPE_CHECKING:
-    from gridworld.world.door.search import Search, State
+    from gridworld.world.door.search import Search
 
 NUMBERS = frozenset(
     {int, float, *(k for k in np.sctypeDict.values() if issubclass(k, np.integer | np.floating))}

@@ -13,7 +13,6 @@ import itertools
 import math
 import pickle
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -22,9 +21,16 @@ from gymnasium import spaces
 
 from gridworld.base.errors import GYMNASIUM, InputError, TooLargeError, in_short, on_a_line
 from gridworld.world.door import known
-from gridworld.world.door.beliefs import Step, lumped
+from gridworld.world.door.beliefs import State, Step, lumped
 from gridworld.world.door.budget import MOST_SECONDS, MOST_STATES, SAMPLED, Budget
-from gridworld.world.door.checks import Resets, check_by_episodes, check_by_word, walk
+from gridworld.world.door.checks import (
+    Resets,
+    check_by_episodes,
+    check_by_word,
+    check_ignored,
+    check_walks,
+    walk,
+)
 from gridworld.world.door.copies import Anew
 from gridworld.world.door.counters import Counter, Read, check_cuts, counted
 from gridworld.world.door.layers import Changed, Env, Layers
@@ -36,30 +42,7 @@ OVER = -1  # in place of the state in which an episode ends
 _BEYOND = 1_000  # states further than a step limit that are found too, so that a small world is whole
 _BATCH = 1_000  # states that are tried before a reset is tried from each of them
 _DEEPEST = 10_000  # steps from the start
-_NOT_REPEATED = (
-    "it does not repeat a walk with the same random numbers, so it depends on more than its attributes and "
-    "np_random: another generator, a clock, a file, something global"
-)
-_INTS = (
-    "it answers an action that is an int in another way than np.int64, which learners send; take both alike, "
-    "e.g. by int(action)"
-)
 Result = tuple[int, bytes, float, bool, bool]
-
-
-@dataclass
-class State:
-    """A state of the environment itself, which an agent may not see."""
-
-    number: int
-    depth: int  # steps from the start
-    copy: bytes  # b"" where it is no longer needed
-    core: bytes  # a digest of its attributes without clocks
-    name: str
-    place: tuple[str, int, int] | None  # which way the agent faces, row and column
-    is_open: bool = False  # an episode goes on in it
-    steps: Sequence[Sequence[Step]] = ()  # the outcomes of each action; empty where none was tried
-    mask: tuple[bool, ...] | None = None  # which actions `action_masks()` allows
 
 
 class Search:
@@ -147,11 +130,7 @@ class Search:
                 changing.update(each for each in before | after if before.get(each) != after.get(each))
 
             as_sent = walk(self, np.int64, look)
-            for kind, mistake in ((np.int64, _NOT_REPEATED), (int, _INTS)):
-                layers.put(self.begin)
-                if walk(self, kind) != as_sent:
-                    layers.check_generators()
-                    raise self.refusal(mistake)
+            check_walks(self, as_sent)
             while True:
                 layers.put(self.begin)
                 layers.leave(changing, series)
@@ -212,14 +191,7 @@ class Search:
         budget, most_states = self.budget, self.budget.most_states
         budget.begin()
         self.first = first = self.layers.take()
-        if unknown := [each for each in self.ignore if each not in self.layers.names()]:
-            self.merged(functools.partial(self.reset_from, first))  # which may make it
-            known_names = dict.fromkeys(self.layers.names())
-            if each := next((each for each in unknown if each not in known_names), None):
-                has = f"has no attribute {each}; it has {', '.join(known_names)}"
-                raise InputError(
-                    f"env.ignore={list(self.ignore)}: {self.where.removeprefix('env.id=')} {has}"
-                )
+        check_ignored(self, first)
         self.resets = Resets(self, first)
         self._waiting: list[State] = []
         self.open(each.following for each in self.resets.starts)

@@ -29,14 +29,14 @@ from numpy.typing import NDArray
 
 from gridworld.base.user_input import check_memory
 from gridworld.world.door.attributes import GENERATORS, attributes
-from gridworld.world.door.beliefs import Beliefs, Node, Step
+from gridworld.world.door.beliefs import Beliefs, Node, State, Step
 from gridworld.world.door.budget import MOST_STATES
 from gridworld.world.door.checks import walk
 from gridworld.world.door.counters import limit_of
 from gridworld.world.door.known import Named, is_kept
 from gridworld.world.door.layers import KEPT, Env, Layers
 from gridworld.world.door.rejection import Rejecting
-from gridworld.world.door.search import Search, State
+from gridworld.world.door.search import Search
 from gridworld.world.mdp import ENUMERATED, Mdp, taken
 from gridworld.world.outcomes import mdp_from_outcomes
 from gridworld.world.shown import of_learners, stacked
