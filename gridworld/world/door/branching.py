@@ -33,9 +33,11 @@ Share = tuple[int, int]  # of all outcomes: numerator and denominator, not in lo
 
 _MOST_DRAWS = 500  # of one step; a loop that rejects what it draws may have any number
 MOST_BRANCHES = 100_000  # of one step
+RAREST = 1e-15  # the probability of all outcomes together that are left out of a draw without end
 _REPEATED = 1_000  # first runs that are repeated, and later one in so many
 _UNLIKE = (
-    "; draw by choice, integers, permutation, binomial, multinomial, or compare random() with a threshold"
+    "; draw by choice, integers, permutation, binomial, multinomial, poisson, geometric, or compare random() "
+    "with a threshold"
 )
 
 
@@ -63,6 +65,7 @@ class Branching:
         self._refused: InputError | None = None  # kept, since an environment may catch it
         # Refuses to go on, after so many outcomes of a step, where the time is over.
         self.check_time: Callable[[int], None] = lambda _: None
+        self.endless = set[str]()  # draws that were made and have any number of outcomes
         self.run = 0  # counts the runs, so that what is left of another one is recognised
         self._is_running = False
         self._num_results = 0
@@ -306,6 +309,25 @@ class Branching:
         number = _many(size, np.int64, lambda: self.decide(weights))
         return int(number) if size is None else number
 
+    def poisson(self, lam: Any = 1.0, size: Any = None) -> Any:
+        """Numbers of events as numpy's, but for the rarest."""
+        return self._counted("poisson", lam, size)
+
+    def geometric(self, p: Any, size: Any = None) -> Any:
+        """Numbers of trials up to the first success as numpy's, but for the rarest."""
+        return self._counted("geometric", p, size)
+
+    def _counted(self, name: str, parameter: Any, size: Any) -> Any:
+        if np.ndim(parameter):
+            self.refuse(f"{name}() with arrays cannot be enumerated")
+        self._check(name, parameter, size)
+        self.endless.add(name)
+        first, weights = _without_end(name, float(parameter))
+        if not weights:
+            self.refuse(f"{name}({parameter}) has more than {MOST_OUTCOMES:,} outcomes")
+        number = _many(size, np.int64, lambda: first + self.decide(weights))
+        return int(number) if size is None else number
+
     def multinomial(self, n: Any, pvals: Any, size: Any = None) -> Any:
         """Counts as numpy's."""
         chances = np.asarray(pvals)
@@ -378,3 +400,20 @@ def _as_numpy_draws(p: Any) -> Weights:
 @lru_cache
 def _binomial(n: int, p: Fraction) -> Weights:
     return weights_of(math.comb(n, count) * p**count * (1 - p) ** (n - count) for count in range(n + 1))
+
+
+@lru_cache
+def _without_end(name: str, parameter: float) -> tuple[int, Weights]:
+    """The first number that is not too rare, and the chances of it and those after it; none of too many."""
+    from scipy.special import gammaln, xlogy  # here, since it takes half a second
+
+    numbers = np.arange(MOST_OUTCOMES + 1)
+    if name == "poisson":
+        chances = np.exp(xlogy(numbers, parameter) - parameter - gammaln(numbers + 1))
+    else:  # failures before the success
+        chances = parameter * (1 - parameter) ** numbers
+    below, above = chances.cumsum(), chances[::-1].cumsum()[::-1]
+    kept = np.flatnonzero(np.minimum(below, above) > RAREST / 2)
+    if not kept.size or kept[-1] == MOST_OUTCOMES:
+        return 0, ()
+    return int(kept[0]) + (name == "geometric"), weights_of(Fraction(each) for each in chances[kept].tolist())

@@ -101,11 +101,19 @@ _new: Any = vars(copyreg)["__newobj__"]  # which pickle knows as a call of __new
 
 @functools.lru_cache(1024)
 def _is_taken_apart(kind: Any) -> bool:
-    """Whether its instances are copied attribute by attribute, for their own way may leave something out."""
+    """Whether its instances are copied attribute by attribute: their own way may leave something out.
+
+    And `__getattr__`, which pickle asks of an object that has no attributes yet, may never come to an end.
+    """
     if issubclass(kind, enum.Enum):  # which pickle keeps as its class's member
         return False
     if issubclass(kind, gym.Env):
         return True
-    ways = ("__getstate__", "__reduce__", "__reduce_ex__")
+    ways = (
+        "__getstate__",
+        "__reduce__",
+        "__reduce_ex__",
+        "__getattr__",
+    )  # which pickle asks before it is whole
     has_its_own = any(getattr(kind, name, None) is not getattr(object, name, None) for name in ways)
     return has_its_own and not (is_library(kind.__module__) or issubclass(kind, _CONTAINERS))

@@ -34,7 +34,10 @@ SAMPLES = 20_000  # real draws that each kind of rejection is compared with
 _AGAIN = 200  # of another state whose step rejects at the same places
 FALSE_ALARM = 1e-9
 _SEED = 20_260_101
-_DRAWS = ("random", "uniform", "integers", "choice", "permutation", "shuffle", "binomial", "multinomial")
+_DRAWS = (
+    *("random", "uniform", "integers", "choice", "permutation", "shuffle"),
+    *("binomial", "multinomial", "poisson", "geometric"),
+)
 Way = tuple[int, tuple[int, ...]]  # to a draw: how many decisions were taken before, and which
 
 

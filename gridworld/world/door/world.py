@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from gridworld.base.user_input import check_memory
 from gridworld.world.door.attributes import GENERATORS, attributes
 from gridworld.world.door.beliefs import Beliefs, Node, State, Step
+from gridworld.world.door.branching import RAREST
 from gridworld.world.door.budget import MOST_STATES
 from gridworld.world.door.checks import walk
 from gridworld.world.door.counters import limit_of
@@ -167,6 +168,8 @@ class _World:
         aliased = self.beliefs.num_aliased()
         found += f"; {aliased:,} observations stand for several of them" if aliased else ""
         found += "; what it truncates, other than by a step limit, is an end" if self._cuts_end else ""
+        endless = " and ".join(f"{each}()" for each in sorted(self.search.branching.endless))
+        found += f"; {endless} without what has a chance below {RAREST:g}" if endless else ""
         readers = sorted(self.search.clock_readers)
         return f"{found}; the clock is read ({', '.join(readers[:3])})" if readers else found
 

@@ -4,7 +4,7 @@ import itertools
 from collections import Counter, deque
 from collections.abc import Callable, Hashable
 from fractions import Fraction
-from math import comb
+from math import comb, exp, lgamma, log
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,8 @@ DRAWS: dict[str, Callable[[Any], Hashable]] = {
     "shuffle": _shuffled,
     "binomial": lambda rng: int(rng.binomial(3, 0.3)),
     "multinomial": lambda rng: tuple(rng.multinomial(3, [0.2, 0.3, 0.5]).tolist()),
+    "poisson": lambda rng: int(rng.poisson(2.5)),
+    "geometric": lambda rng: tuple(rng.geometric(0.7, size=2).tolist()),
     "several shuffles": lambda rng: (rng.permutation(0).size, _shuffled(rng)),
     "a shuffled deque": lambda rng: _shuffled(rng, deque),
     "an instance": lambda rng: isinstance(rng, np.random.Generator) and isinstance(rng.random(), float),
@@ -89,6 +91,10 @@ def test_probabilities_are_exact() -> None:
     assert outcomes(DRAWS["binomial"]) == {
         k: comb(3, k) * share**k * (1 - share) ** (3 - k) for k in range(4)
     }
+    assert outcomes(lambda rng: (rng.poisson(0), rng.geometric(1))) == {(0, 1): 1}
+    found = outcomes(lambda rng: rng.poisson(400.0))  # of which the least are rare, too
+    assert sum(k * share for k, share in found.items()) == pytest.approx(400, rel=1e-12)
+    assert float(found[400]) == pytest.approx(exp(400 * log(400) - 400 - lgamma(401)), rel=1e-11)
     edges = [Fraction(each) for each in [0.0, *np.cumsum(SHARES).tolist()]]
     found = outcomes(DRAWS["categorical"])
     assert [found[k] for k in range(4)] == [end - start for start, end in itertools.pairwise(edges)]
@@ -103,6 +109,8 @@ def test_probabilities_are_exact() -> None:
         lambda rng: rng.integers(3, dtype=np.int8),
         lambda rng: rng.integers(3, dtype=int),
         lambda rng: rng.binomial(3, 0.5),
+        lambda rng: rng.poisson(0.5),
+        lambda rng: rng.geometric(0.5),
         lambda rng: rng.random() < 0.5,
         lambda rng: 1 - rng.random() > np.float64(0.5),
         lambda rng: 2 * rng.random(2)[0] >= 1,
@@ -134,7 +142,10 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], str]] = {
     "a method": (lambda rng: rng.random().hex(), "used for more than comparisons"),
     "equality": (lambda rng: rng.random() == 0.5, "used for more than comparisons"),
     "normal": (lambda rng: rng.normal(), r"np_random.normal\(\) has too many outcomes"),
-    "poisson": (lambda rng: rng.poisson(2), r"np_random.poisson\(\) has too many outcomes"),
+    "gamma": (lambda rng: rng.gamma(2), r"np_random.gamma\(\) has too many outcomes"),
+    "a large mean": (lambda rng: rng.poisson(20_000), r"poisson\(20000\) has more than 10,000 outcomes"),
+    "a small chance": (lambda rng: rng.geometric(1e-9), r"geometric\(1e-09\) has more than 10,000 outc"),
+    "several poisson": (lambda rng: rng.poisson([2, 3]), r"poisson\(\) with arrays cannot be enumerated"),
     "many integers": (lambda rng: rng.integers(10**6), "a draw has 1,000,000 outcomes"),
     "many draws": (lambda rng: str(rng.integers(100, size=3)), "more than 300 random outcomes"),
     "no last draw": (

@@ -170,6 +170,29 @@ class OfNumpyInReset(SeededInReset):
         return Line.reset(self, seed=None)
 
 
+class Proxy:
+    """Stands for what it holds; while it is copied and holds nothing yet, it cannot be asked anything."""
+
+    def __init__(self, held: Any) -> None:
+        self.held = held
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.held, name)
+
+
+class ByProxy(Line):
+    """What it holds has its place."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.places = Proxy(np.zeros(4))
+        return super().reset(seed=seed)
+
+    def step(self, action: int) -> Result:
+        shown, reward, *rest = super().step(action)
+        self.places.held[self.at] = 1
+        return shown, reward * self.places.sum(), *rest
+
+
 class Views(Line):
     """What is written into one array is read from another that shows the same memory."""
 
@@ -266,6 +289,7 @@ TRUTH: dict[str, tuple[Callable[[], Any], float]] = {
     "a generator made in __init__": (SeededInInit, coin()),
     "a generator made in reset": (SeededInReset, coin()),
     "a generator of numpy's made in reset": (OfNumpyInReset, coin()),
+    "a proxy": (ByProxy, 4 * GAMMA**3),  # it stays once, and then has been everywhere
     "views of one array": (Views, GAMMA**2 - 0.25 * (GAMMA + GAMMA**2)),
     "a sample of its actions": (SampleOfSpace, slipping(0.05)),
     "the tutorial": (lambda: Target(3), of_target(3)),
