@@ -57,15 +57,15 @@ class Budget:
         """Refuse to go on where its time is over, in a step that has had so many outcomes."""
         if self.seconds_left() < 0:
             size, search = len(self._search.states), self._search
+            more = f"{'env.' * self._is_by_settings}most_seconds={2 * self._most_seconds:g} allows more"
             if outcomes >= size:  # so that is what took long
                 raise search.too_large(
                     "a reset or a step has more random outcomes than can be tried in the time allowed: "
-                    f"after {outcomes:,} there are more"
+                    f"after {outcomes:,} there are more ({more})"
                 )
-            more = f"{'env.' * self._is_by_settings}most_seconds={2 * self._most_seconds:g}"
             raise search.too_large(
-                f"after {self._most_seconds:g} s it still finds new states ({size:,} so far; {more} allows "
-                f"more), since its {self.what_changes()}"
+                f"after {self._most_seconds:g} s it still finds new states ({size:,} so far; {more}), since "
+                f"its {self.what_changes()}"
             )
 
     def show(self, what: str) -> None:
@@ -86,6 +86,8 @@ class Budget:
         """The attributes, or times, of most values that only later states have; empty: none has several."""
         values: dict[str, dict[Any, int]] = {}  # with the number of the state in which each is met first
         layers, ignore = self._search.layers, self._search.ignore
+        if layers.clocks and 2 * len(self._search.cores) < len(self._search.states):
+            return ", ".join(sorted(clock.key[1] for clock in layers.clocks))
         found = [each for each in self._search.states[::SAMPLED] if each.copy][-_MOST_SAMPLES:]
         for number, state in enumerate(found):
             layers.put(state.copy, state.depth)

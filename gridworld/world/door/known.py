@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 import threading
 import time
@@ -76,6 +77,13 @@ def records(layer: Any) -> bool:
 def is_limit(layer: Any) -> bool:
     """Whether a wrapper is Gymnasium's time limit."""
     return type(layer) is wrappers.TimeLimit and "step" not in vars(layer) and "reset" not in vars(layer)
+
+
+def reset_options(env: Any, has_layers: bool) -> dict[str, None]:
+    """What a reset is given: what layers around it give, and what SB3 does in place of a seed of its own."""
+    taken = inspect.signature(env.reset).parameters
+    has_own = "seed" in taken and taken["seed"].default not in (None, inspect.Parameter.empty)
+    return dict.fromkeys([*["options"] * has_layers, *["seed"] * has_own])
 
 
 def steps_once(layer: Any) -> bool:

@@ -80,7 +80,7 @@ class Layers:
             elif known.records(layer) and not all(map(known.steps_once, self.layers)):
                 chain.append(known.Recorded(layer.env))
         self.env: Any = self.layers[0]
-        self.reset_options = {} if self.env is env else {"options": None}  # as a layer around it has it
+        self.reset_options = known.reset_options(self.env, has_layers=self.env is not env)
         self.base: Any = self.layers[-1]
         holders = holders_of(dict.fromkeys(kind for layer in self.layers for kind in type(layer).__mro__))
         found = shared_with(holders) if keeps_shared else []

@@ -184,7 +184,7 @@ class Search:
         # By their cores, and by the time if there are clocks.
         self._states: dict[tuple[bytes, int], State] = {}
         self._rows: dict[Any, Any] = {}  # what follows in a core by an action, and where that holds
-        self._cores: dict[bytes, State] = {}  # what states that differ in their clocks have in common
+        self.cores: dict[bytes, State] = {}  # what states that differ in their clocks have in common
         self._reset_cores: set[bytes] = set()  # from which a reset was tried
         self._ended: set[bytes] = set()
         self._waiting_ends: list[bytes] = []  # copies of new ends, from which no reset was tried yet
@@ -374,7 +374,7 @@ class Search:
             copy = self.layers.take() if self.ignore or self._read else key
             like = State(0, 0, copy, short, *known.place_of(self.layers.base))
             if self.layers.clocks:  # one copy for all times
-                like = self._cores.setdefault(short, like)
+                like = self.cores.setdefault(short, like)
             state = self._added(like, depth, len(copy) if like.copy is copy else 0)
         return state.number, seen
 

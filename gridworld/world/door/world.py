@@ -91,6 +91,7 @@ class _World:
         first = [[list(map(of_classes, row)) for row in found[0].steps] for found in self.members[:-1]]
         starts = [(each.probability, classes[each.following], each.seen) for each in search.resets.starts]
         budget = search.budget
+        budget.check_seconds()
         self.beliefs = beliefs = Beliefs(
             starts, [*first, []], search.too_large, budget.seconds_left(), budget.show, limit
         )

@@ -164,6 +164,13 @@ class SeededInReset(SeededInInit):
         return super().reset(seed=None)
 
 
+class SeededByDefault(SeededInReset):
+    """The same, but learners always give it `seed=None`."""
+
+    def reset(self, seed: int | None = 42, options: Any = None) -> tuple[Any, dict[str, Any]]:  # type: ignore[override]
+        return super().reset(seed=seed)
+
+
 class OfNumpyInReset(SeededInReset):
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         self.np_random = np.random.default_rng(seed)
@@ -288,6 +295,8 @@ TRUTH: dict[str, tuple[Callable[[], Any], float]] = {
     "so many rooms that they are left in place": (lambda: Rooms(80), GAMMA**78),
     "a generator made in __init__": (SeededInInit, coin()),
     "a generator made in reset": (SeededInReset, coin()),
+    "a seed of its own": (SeededByDefault, coin()),
+    "a wrapped seed of its own": (lambda: wrappers.OrderEnforcing(SeededByDefault()), coin()),
     "a generator of numpy's made in reset": (OfNumpyInReset, coin()),
     "a proxy": (ByProxy, 4 * GAMMA**3),  # it stays once, and then has been everywhere
     "views of one array": (Views, GAMMA**2 - 0.25 * (GAMMA + GAMMA**2)),
@@ -1095,6 +1104,28 @@ class Hurries(gym.Env):
 def test_a_search_with_too_many_states_names_what_has_ever_more_values():
     with pytest.raises(InputError, match=r"more than 800 states .* since its count keeps changing"):
         gridworld.compile_env(Hurries, most_states=800)
+
+
+class Fined(Hurries):
+    """Forty places, and a fine where time is over: a state is met at each of a hundred times."""
+
+    observation_space = gym.spaces.MultiDiscrete([40, 40])
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        self.place, self.goal = self.np_random.choice(40, 2, replace=False).tolist()
+        self.count = 0
+        return (self.place, self.goal), {}
+
+    def step(self, action):
+        self.place, self.count = (self.place + 2 * int(action) - 1) % 40, self.count + 1
+        is_late = self.count == 100
+        return (self.place, self.goal), -1.0 if is_late else 0.0, self.place == self.goal, is_late, {}
+
+
+def test_a_search_with_too_many_states_names_the_count_that_multiplies_them():
+    with pytest.raises(InputError, match=r"more than 10,000 states .* since its count keeps changing"):
+        gridworld.compile_env(Fined, most_states=10_000)
 
 
 class Sampled(Wanders):
