@@ -1107,25 +1107,24 @@ def test_a_search_with_too_many_states_names_what_has_ever_more_values():
 
 
 class Fined(Hurries):
-    """Forty places, and a fine where time is over: a state is met at each of a hundred times."""
+    """A thousand goals, and a fine where time is over: each state is met at each of a hundred times."""
 
-    observation_space = gym.spaces.MultiDiscrete([40, 40])
+    observation_space = gym.spaces.MultiDiscrete([10, 1000])
 
     def reset(self, *, seed=None, options=None):
         gym.Env.reset(self, seed=seed)
-        self.place, self.goal = self.np_random.choice(40, 2, replace=False).tolist()
-        self.count = 0
+        self.place, self.goal, self.count = 0, int(self.np_random.integers(1000)), 0
         return (self.place, self.goal), {}
 
     def step(self, action):
-        self.place, self.count = (self.place + 2 * int(action) - 1) % 40, self.count + 1
+        self.place, self.count = (self.place + 2 * int(action) - 1) % 10, self.count + 1
         is_late = self.count == 100
         return (self.place, self.goal), -1.0 if is_late else 0.0, self.place == self.goal, is_late, {}
 
 
 def test_a_search_with_too_many_states_names_the_count_that_multiplies_them():
-    with pytest.raises(InputError, match=r"more than 10,000 states .* since its count keeps changing"):
-        gridworld.compile_env(Fined, most_states=10_000)
+    with pytest.raises(InputError, match=r"more than 25,000 states .* since its count keeps changing"):
+        gridworld.compile_env(Fined, most_states=25_000)
 
 
 class Sampled(Wanders):
