@@ -83,12 +83,12 @@ def lumped(steps: Sequence[Sequence[Sequence[Step]]], apart: Sequence[Any]) -> l
         first.setdefault((bool(rows), each), len(first)) for rows, each in zip(steps, apart, strict=True)
     ]
     members: list[set[int]] = [set() for _ in first]
-    leading: list[set[int]] = [set() for _ in steps]  # the states before each
+    leading: list[list[int]] = [[] for _ in steps]  # the states before each
     for state, rows in enumerate(steps):
         members[classes[state]].add(state)
         for step in itertools.chain.from_iterable(rows):
             if step.following >= 0:
-                leading[step.following].add(state)
+                leading[step.following].append(state)
     changed = set(range(len(steps)))
     while changed:
         split: dict[int, dict[Any, list[int]]] = {}  # the changed states of a class by what follows
