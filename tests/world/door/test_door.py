@@ -871,6 +871,14 @@ class Locking(Coins):
         self.lock = threading.Lock()
 
 
+class Spaceless(Raising):
+    """It does not say what it shows."""
+
+    @property
+    def observation_space(self) -> Any:  # type: ignore[override]
+        return self.shown_space
+
+
 def test_two_limits_around_a_wrapper_that_skips() -> None:
     env = Passing(wrappers.TimeLimit(Skipping(wrappers.TimeLimit(Coins(), 4)), 4))
     assert gridworld.compile_env(env).max_episode_steps == 2
@@ -878,7 +886,11 @@ def test_two_limits_around_a_wrapper_that_skips() -> None:
 
 @pytest.mark.parametrize(
     ("make", "told"),
-    [(Raising, "__getattr__ raises KeyError"), (Locking, "its attribute lock cannot be copied")],
+    [
+        (Raising, "__getattr__ raises KeyError"),
+        (Locking, "its attribute lock cannot be copied"),
+        (Spaceless, "its observation_space is not a gymnasium space"),
+    ],
 )
 def test_what_cannot_be_asked_or_copied_is_refused(make: Callable[[], Any], told: str) -> None:
     with pytest.raises(InputError, match=told):
