@@ -135,7 +135,7 @@ def test_workers_step_as_the_world_does(atlas: Any, name: str) -> None:
     [world] = [each for each in atlas.plan.worlds_of("implementations") if each.name == name]
     tables = json.loads(world.tables)
     lines: list[dict[str, Any]] = []
-    reader = atlas.adapters.Reader({"every": 7, "steps": 50, "world": tables}, None)
+    reader = atlas.adapters.Reader({"every": 7, "steps": 50, "seeds": [0], "world": tables}, None)
     reader.write = lambda **line: lines.append(line)
     reader.greedy = lambda rows: rows.argmax(axis=1)
     env = atlas.adapters.TableEnv(tables, reader)
