@@ -90,7 +90,7 @@ def plain(job: dict[str, Any], reader: Reader) -> None:
         state = env.reset()[0].argmax() if terminated or truncated else reached
 
 
-def sb3_like(job: dict[str, Any], reader: Reader) -> Saved:
+def sb3(job: dict[str, Any], reader: Reader) -> Saved:
     """Stable-Baselines3 and SBX, which has its interface, in their own loop."""
     from stable_baselines3.common.env_util import make_vec_env
 
@@ -105,6 +105,9 @@ def sb3_like(job: dict[str, Any], reader: Reader) -> Saved:
     reader.greedy = greedy_of(model)
     model.learn(job["steps"])
     return lambda path: model.save(path) or greedy_of(kind.load(path, device="cpu"))
+
+
+sbx = sb3
 
 
 def cleanrl(job: dict[str, Any], reader: Reader) -> Saved:
@@ -172,12 +175,11 @@ def main() -> None:
     job, out = json.load(sys.stdin), sys.stdout
     job["world"] = json.loads(job["world"])
     sys.stdout, reader = sys.stderr, Reader(job, out)
-    made = {"entry_point": lambda: TableEnv(job["world"], reader), "disable_env_checker": True}
-    gym.register("Atlas-v0", max_episode_steps=job["world"]["limit"], **made)
+    make: Any = lambda: TableEnv(job["world"], reader)  # noqa: E731
+    gym.register("Atlas-v0", make, max_episode_steps=job["world"]["limit"], disable_env_checker=True)
     with tempfile.TemporaryDirectory() as place:
         os.chdir(place)  # where CleanRL writes runs/
-        learn = {"sb3": sb3_like, "sbx": sb3_like, "cleanrl": cleanrl, "engine": engine, "plain": plain}
-        saved = learn[job["library"]](job, reader)
+        saved = globals()[job["library"]](job, reader)
         reader.read()
         if "play" in job and saved is not None:
             reader.write(**play(job["play"], saved(f"{place}/model")))

@@ -4,7 +4,6 @@ import itertools
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,23 +23,15 @@ _TWO = "{:.2f}".format
 _SHOWN = ("certified for good", "median steps to it", "regret at the end", "a run takes")
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(NamedTuple):
     """The rows of one library's algorithm in one world."""
 
     library: str
     algorithm: str
     world: World
     rows: list[Row]  # by seed
-
-    @property
-    def steps(self) -> np.ndarray:
-        """(n,), steps to certified for good; infinity where it is not."""
-        return np.array([float(row.certified_since or math.inf) for row in self.rows])
-
-    @property
-    def certified(self) -> statistics.Share:
-        return statistics.share(int(np.isfinite(self.steps).sum()), len(self.rows))
+    steps: np.ndarray  # to certified for good; infinity where it is not
+    certified: statistics.Share
 
 
 def groups(rows: Sequence[Row], page: str) -> list[Group]:
@@ -51,7 +42,10 @@ def groups(rows: Sequence[Row], page: str) -> list[Group]:
         name = (page, library, algorithm, world.name)
         own = [row for row in rows if row[:4] == name and row.versions == newest[library]]
         if own and (own := [row for row in own if row.digest == Job(*name[:3], world, 0).digest]):
-            kept.append(Group(library, algorithm, world, sorted(own, key=lambda row: int(row.seed))))
+            own.sort(key=lambda row: int(row.seed))
+            steps = np.array([float(row.certified_since or math.inf) for row in own])
+            share = statistics.share(int(np.isfinite(steps).sum()), len(own))
+            kept.append(Group(library, algorithm, world, own, steps, share))
     return kept
 
 
@@ -68,8 +62,8 @@ class Comparison(NamedTuple):
 def compare(first: Group, second: Group) -> Comparison:
     """Compare two groups."""
     least, both = min(len(first.rows), len(second.rows)), (first.steps, second.steps)
-    curves = {row.seed: (row.curve, row.done) for row in first.rows}
-    identical = sum(curves.get(row.seed) == (row.curve, row.done) for row in second.rows)
+    curves = {(row.seed, row.curve, row.done) for row in first.rows}
+    identical = sum((row.seed, row.curve, row.done) in curves for row in second.rows)
     ratio, p = equivalence(*both) if least > 1 and np.isfinite(np.concatenate(both)).all() else (None, None)
     apart = ratio or statistics.difference(first.certified, second.certified)
     is_apart = apart.low > (ratio is not None) or apart.high < (ratio is not None)  # than 1, than 0
@@ -155,7 +149,7 @@ def _implementations(found: list[Group], figures: Path) -> dict[str, str]:
             place = (one.algorithm, one.world.name, f"{one.library} : {other.library}")
             pairs.append((*place, verdict, same, _interval(improvement, _TWO), *tested))
     named = ("algorithm", "world", "library")
-    tested = ("same curve", "P(first is faster)", "ratio of steps, 90 %", f"p, margin {MARGIN}")
+    numbers = ("same curve", "P(first is faster)", "ratio of steps, 90 %", f"p, margin {MARGIN}")
     drawn = [_curves(name, found, figures) for name in MATCHED if any(g.algorithm == name for g in found)]
     lists = {**MATCHED, "names in CleanRL": {name: f"`{own}`" for name, own in CLEANRL.items()}}
     settings = [
@@ -165,7 +159,7 @@ def _implementations(found: list[Group], figures: Path) -> dict[str, str]:
     return {
         "settings": "\n".join(settings),
         "results": _table((*named, *_SHOWN), lines),
-        "pairs": _table((*named[:2], "pair", "verdict", *tested), pairs, 4),
+        "pairs": _table((*named[:2], "pair", "verdict", *numbers), pairs, 4),
         "figures": "\n\n".join(drawn),
     }
 
@@ -176,8 +170,8 @@ def _curves(algorithm: str, found: Sequence[Group], figures: Path) -> str:
     worlds, drawn = list(dict.fromkeys(group.world.name for group in own)), styles(list(LIBRARIES))
     down, across = -(-len(worlds) // 3), min(3, len(worlds))
     with house_style(algorithm):
-        shape = {"figsize": (3.2 * across + 0.6, 2.4 * down + 0.6), "layout": "constrained"}
-        figure, axes = plt.subplots(down, across, squeeze=False, **shape)
+        size = (3.2 * across + 0.6, 2.4 * down + 0.6)
+        figure, axes = plt.subplots(down, across, squeeze=False, figsize=size, layout="constrained")
         handles = {}
         for axis, world in itertools.zip_longest(axes.flat, worlds):
             axis.set_visible(world is not None)
@@ -195,14 +189,14 @@ def _curves(algorithm: str, found: Sequence[Group], figures: Path) -> str:
 
 
 def _defaults(found: list[Group], figures: Path) -> dict[str, str]:
-    kinds, worlds = defaultdict(list), defaultdict(dict)
+    kinds, worlds = defaultdict(list), defaultdict[World, dict[tuple[str, str], str]](dict)
     for group in found:
         kinds[group.library, group.algorithm].append(group)
         worlds[group.world][group.library, group.algorithm] = _share(group.certified)
     lines = []
     for kind, own in sorted(kinds.items()):
         each = [row for group in own for row in group.rows]
-        share = statistics.share(sum(bool(row.certified_since) for row in each), len(each))
+        share = statistics.share(sum(group.certified.count for group in own), len(each))
         scales = [abs(evaluator(group.world, DISCOUNT).optimal_value) for group in own]
         shares = [np.minimum([row.regret / s for row in g.rows], 1) for g, s in zip(own, scales, strict=True)]
         regret = statistics.interval(statistics.mean, shares, SEED)

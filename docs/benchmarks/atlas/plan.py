@@ -52,7 +52,7 @@ class World:
 @cache
 def evaluator(world: World, gamma: float) -> Evaluator:
     """Scores policies of a world."""
-    return Evaluator(world.mdp, gamma, world.mdp.max_episode_steps)
+    return Evaluator(world.mdp, gamma, world.mdp.max_episode_steps or 0)  # of which each world has one
 
 
 def _world(name: str, env: str | None = None, **settings: Any) -> World:
@@ -104,18 +104,17 @@ class Library(NamedTuple):
 
 _OLD = "gymnasium==0.29.1 numpy==1.26.4 tyro==1.0.17 tensorboard==2.21.0 torch==2.13.0"
 _CLEANRL = ("https://github.com/vwxyzjn/cleanrl", "fe8d8a03c41a7ef5b523e2e354bd01c363e786bb")
+_TORCH = "torch gymnasium numpy"
+_WEIGHTS = {"policy_kwargs": {"net_arch": [64, 64], "ortho_init": False}}  # torch's own first ones
 LIBRARIES = {
-    "sb3": Library("stable_baselines3 torch gymnasium numpy", "dqn ppo a2c"),
+    "sb3": Library(f"stable_baselines3 {_TORCH}", "dqn ppo a2c"),
     "engine": Library("gridworld torch numpy", "dqn ppo a2c q_learning"),
     "plain": Library("gymnasium numpy", "q_learning"),
     "sbx": Library("sbx_rl jax flax", "dqn ppo", "sbx-rl==0.28.0 jax==0.10.2 flax==0.12.8 torch==2.13.0"),
-    "cleanrl": Library("torch gymnasium numpy", "dqn ppo", _OLD, _CLEANRL),
-}
-LIBRARIES |= {  # with one thing changed, to see what a difference comes from
-    "sb3+weights": LIBRARIES["sb3"]._replace(
-        algorithms="ppo", more={"policy_kwargs": {"net_arch": [64, 64], "ortho_init": False}}
-    ),
-    "cleanrl+l1": LIBRARIES["cleanrl"]._replace(algorithms="dqn", more={"change": ("F.mse", "F.smooth_l1")}),
+    "cleanrl": Library(f"{_TORCH} commit", "dqn ppo", _OLD, _CLEANRL),
+    # with one thing changed, to see what a difference comes from
+    "sb3+weights": Library(f"stable_baselines3 {_TORCH}", "ppo", more=_WEIGHTS),
+    "cleanrl+l1": Library(f"{_TORCH} commit", "dqn", _OLD, _CLEANRL, {"change": ("F.mse", "F.smooth_l1")}),
 }
 
 # Steps, and N, of which the number of environments is a divisor.
@@ -145,16 +144,16 @@ CLEANRL = {
 def settings_of(library: str, algorithm: str) -> dict[str, Any]:
     """The matched settings by the library's own names."""
     own, base = dict(MATCHED[algorithm]), library.partition("+")[0]
-    hidden = own.pop("net_arch", None)  # what the scripts of CleanRL have
     if base == "cleanrl":
+        del own["net_arch"]  # which is in its scripts
         own = {CLEANRL.get(name, name): value for name, value in own.items()}
         if algorithm == "ppo":
             own["num_minibatches"] = own["num_envs"] * own["num_steps"] // own.pop("batch_size")
             own["vf_coef"] *= 2  # of half a square
             own |= {"anneal_lr": False, "clip_vloss": False}
-    elif hidden is not None:
-        is_sbx_ppo = (base, algorithm) == ("sbx", "ppo")
-        own["policy_kwargs"] = {"net_arch": hidden, **({"ortho_init": True} if is_sbx_ppo else {})}
+    elif base in ("sb3", "engine", "sbx") and "net_arch" in own:
+        more = {"ortho_init": True} if (base, algorithm) == ("sbx", "ppo") else {}
+        own["policy_kwargs"] = {"net_arch": own.pop("net_arch"), **more}
     return own | (LIBRARIES[library].more or {})
 
 
@@ -185,14 +184,12 @@ class Job:
         is_default = self.page == "defaults"
         steps, every = DEFAULTS if is_default else LENGTHS[self.algorithm]
         settings = {} if is_default else settings_of(self.library, self.algorithm)
-        base = self.library.partition("+")[0]
-        found = {"library": base, "algorithm": self.algorithm, "steps": steps, "every": every}
+        found = {"algorithm": self.algorithm, "steps": steps, "every": every}
+        found |= {"library": self.library.partition("+")[0]}
         if self.library == "engine" or (is_default and self.library == "sb3"):  # in its own loop
-            own_loop = ["agent.engine=stock"] if self.library == "sb3" else []
-            words = [*own_loop, *_words(self.algorithm, settings, self.world)]
-            diagnosed = {"diagnose": True} if is_default else {}
-            scored = f"evaluation.gamma={self.gamma}"
-            return found | {"library": "engine", "words": [*words, scored], **diagnosed}
+            words = ["agent.engine=stock"] if self.library == "sb3" else []
+            words += [*_words(self.algorithm, settings, self.world), f"evaluation.gamma={self.gamma}"]
+            return found | {"library": "engine", "words": words} | ({"diagnose": True} if is_default else {})
         return found | {"settings": settings, "commit": LIBRARIES[self.library].source[1]}
 
     @property
@@ -229,8 +226,8 @@ def versions(library: str) -> str:
     found = {"gridworld": gridworld.__version__}  # which runs in a checkout
     for each in importlib.metadata.distributions(path=places if pins else sys.path):
         found.setdefault(each.metadata["Name"].replace("-", "_").lower(), each.version)
-    commit = [f"commit {source[1][:8]}"] if source[1] else []
-    return ", ".join([*(f"{name} {found.get(name, 'missing')}" for name in named.split()), *commit])
+    found["commit"] = source[1][:8]
+    return ", ".join(f"{name} {found.get(name, 'missing')}" for name in named.split())
 
 
 def jobs(page: str, libraries: list[str], algorithms: list[str], worlds: list[str], seeds: int) -> list[Job]:

@@ -49,16 +49,12 @@ class Row(NamedTuple):
 
 def read(path: Path) -> list[Row]:
     """All rows of a file; none where there is no file."""
-    if not path.exists():
-        return []
     kinds: dict[str, Any] = {"done": int, "every": int, "seconds": float, "regret": float}
-    with path.open(encoding="utf-8", newline="") as file:
-        try:
-            found = list(csv.DictReader(file))
-            lines = [{name: kinds.get(name, str)(row[name]) for name in Row._fields} for row in found]
-        except (KeyError, TypeError, ValueError):
-            raise InputError(f"{path}: has other columns or half a line; delete that line") from None
-    return [Row(**line) for line in lines]
+    found = csv.DictReader(path.read_text("utf-8").splitlines() if path.exists() else [])
+    try:
+        return [Row(**{name: kinds.get(name, str)(row[name]) for name in Row._fields}) for row in found]
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{path}: has other columns or half a line; delete that line") from None
 
 
 def append(path: Path, row: Row) -> None:
@@ -70,7 +66,7 @@ def append(path: Path, row: Row) -> None:
 
 
 def work(jobs: list[Job], **more: Any) -> list[dict[str, Any]]:
-    """The lines that a worker writes for jobs that differ in their seeds; those with actions have a `score`."""
+    """What a worker writes for jobs that differ in their seeds; lines with actions have a `score`."""
     job, seeds = jobs[0], [each.seed for each in jobs]
     task = {**job.content, "seeds": seeds, "world": job.world.tables, "room": str(ROOM), **more}
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore", "PYTHONPATH": str(ROOT)}
@@ -93,40 +89,35 @@ def work(jobs: list[Job], **more: Any) -> list[dict[str, Any]]:
 def run(jobs: list[Job]) -> list[Row]:
     """Train jobs that differ in their seeds, and make a row of each."""
     started = time.perf_counter()
-    lines = work(jobs)
+    lines, found = work(jobs), []
     seconds = round((time.perf_counter() - started) / len(jobs), 1)
-    return [_row(job, [line for line in lines if line["seed"] == job.seed], seconds) for job in jobs]
-
-
-def _row(job: Job, lines: list[dict[str, Any]], seconds: float) -> Row:
-    curve, since, before, last = [], "", "", {"cause": ""}
-    for line in lines:
-        last |= line
-        if "regret" in line:
-            since = (since or str(line["step"])) if line["certified"] else ""
-            text = "0*" if line["certified"] else f"{line['regret']:.9g}"
-            curve += [f"{line['step']}:{text}"] if text != before else []
-            before = text
-    regret = float(before.rstrip("*"))
-    rest = last["step"], job.content["every"], seconds, since, regret, last["cause"], " ".join(curve)
-    return Row(*job.key, *rest)
+    for job in jobs:
+        curve, since, last, text = [], "", {"cause": ""}, ""
+        for line in (each for each in lines if each["seed"] == job.seed):
+            last |= line
+            if "regret" in line:
+                since = (since or str(line["step"])) if line["certified"] else ""
+                before, text = text, "0*" if line["certified"] else f"{line['regret']:.9g}"
+                curve += [f"{line['step']}:{text}"] if text != before else []
+        rest = seconds, since, float(text.rstrip("*")), last["cause"], " ".join(curve)
+        found.append(Row(*job.key, last["step"], job.content["every"], *rest))
+    return found
 
 
 def estimate(jobs: list[Job], path: Path, processes: int) -> str:
     """How long the jobs take, by the rows that are there."""
-    seconds = defaultdict(list)
+    seconds, kinds = defaultdict(list), [job.key[:3] for job in jobs]
     for row in read(path):
-        seconds[row.page, row.library, row.algorithm].append(row.seconds)
-    kinds = [(job.page, job.library, job.algorithm) for job in jobs]
+        seconds[row[:3]].append(row.seconds)
     known = [statistics.median(seconds[kind]) for kind in kinds if kind in seconds]
     unknown = ", ".join(sorted({" ".join(kind[1:]) for kind in kinds if kind not in seconds}))
     text = f"{len(jobs)} rows to run; {len(known)} of them take {sum(known) / processes / 3600:.2f} hours"
     return text + (f"; no time is known of {unknown}" if unknown else "")
 
 
-def run_all(jobs: list[Job], path: Path, processes: int) -> list[str]:
-    """Run jobs, so many processes at once, the engine's seeds as one population; returns what failed."""
-    failed, count, batches = [], 0, defaultdict(list)
+def run_all(jobs: list[Job], path: Path, processes: int) -> None:
+    """Run jobs, so many processes at once, the engine's seeds as one population; says what failed."""
+    failed, done, batches = [], 0, defaultdict(list)
     for job in jobs:
         batches[job.key[:4], None if job.library == "engine" else job.seed].append(job)
     with ThreadPoolExecutor(processes) as pool:
@@ -136,13 +127,14 @@ def run_all(jobs: list[Job], path: Path, processes: int) -> list[str]:
                 if isinstance(error := future.exception(), InputError):
                     failed.append(str(error))
                     continue
-                for count, row in enumerate(future.result(), count + 1):
+                for done, row in enumerate(future.result(), done + 1):  # noqa: B020
                     append(path, row)
                     end = f"certified since {row.certified_since}" if row.certified_since else "not certified"
-                    print(f"{count}/{len(jobs)} {' '.join(row[1:5])}: {end}, {row.seconds} s", flush=True)
+                    print(f"{done}/{len(jobs)} {' '.join(row[1:5])}: {end}, {row.seconds} s", flush=True)
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
-    return failed
+    if failed:
+        raise InputError("\n".join([f"{len(failed)} rows failed:", *failed]))
 
 
 def install(library: str) -> None:
