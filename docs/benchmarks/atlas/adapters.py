@@ -14,6 +14,7 @@ import tempfile
 from bisect import bisect_right
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -42,7 +43,10 @@ class Reader:
 
     def read(self) -> None:
         if self.greedy is not None:
-            self.write(step=self.count, actions=np.asarray(self.greedy(self.rows)).reshape(-1).tolist())
+            self.write(
+                step=min(self.count, self._steps),
+                actions=np.asarray(self.greedy(self.rows)).reshape(-1).tolist(),
+            )
 
     def write(self, **line: Any) -> None:
         print(json.dumps({"seed": self.seed, **line}), file=self._out, flush=True)
@@ -72,22 +76,45 @@ class TableEnv(gym.Env):
         return self._reader.rows[self._state].copy(), reward, is_over, False, {}
 
 
+def epsilon(job: dict[str, Any], step: int) -> Any:
+    s = job["settings"]
+    first, last = s["exploration_initial_eps"], s["exploration_final_eps"]
+    return first + min(step / job["steps"] / s["exploration_fraction"], 1.0) * (last - first)
+
+
 def plain(job: dict[str, Any], reader: Reader) -> None:
     """The textbook's Q-learning (Sutton and Barto, 2nd ed., section 6.5) in one environment."""
     s, rng, env = job["settings"], np.random.default_rng(reader.seed), gym.make("Atlas-v0")
-    q = np.full((reader.rows.shape[1], int(env.action_space.n)), s["initial_value"])
+    q = np.full((reader.rows.shape[1], len(job["world"]["next_state"][0])), s["initial_value"])
     reader.greedy = lambda rows: q[rows.argmax(axis=1)].argmax(axis=1)
-    first, last = s["exploration_initial_eps"], s["exploration_final_eps"]
     state = env.reset(seed=reader.seed)[0].argmax()
     for step in range(job["steps"]):
-        epsilon = first + min(step / job["steps"] / s["exploration_fraction"], 1.0) * (last - first)
         greedy = rng.choice(np.flatnonzero(q[state] == q[state].max()))
-        action = rng.integers(len(q[state])) if rng.random() < epsilon else greedy
+        action = rng.integers(len(q[state])) if rng.random() < epsilon(job, step) else greedy
         observation, reward, terminated, truncated, _ = env.step(action)
         reached = observation.argmax()
         target = reward + s["gamma"] * q[reached].max() * (not terminated)
         q[state, action] += s["learning_rate"] * (target - q[state, action])
         state = env.reset()[0].argmax() if terminated or truncated else reached
+
+
+def of_torch(reader: Reader, network: Callable[[], Any], scores: Any = lambda net, rows: net(rows)) -> Saved:
+    """Read the action with the highest score of a network."""
+    import torch
+
+    def greedy(rows: np.ndarray) -> Any:
+        with torch.no_grad():
+            return scores(network(), torch.tensor(rows)).argmax(dim=1).numpy()
+
+    def saved(path: str) -> Greedy:
+        torch.save(network().state_dict(), path)
+        for parameter in network().parameters():
+            parameter.data.zero_()
+        network().load_state_dict(torch.load(path))
+        return greedy
+
+    reader.greedy = greedy
+    return saved
 
 
 def sb3(job: dict[str, Any], reader: Reader) -> Saved:
@@ -112,8 +139,6 @@ sbx = sb3
 
 def cleanrl(job: dict[str, Any], reader: Reader) -> Saved:
     """CleanRL's script as it is, executed with arguments of its own; its network is found by its name."""
-    import torch
-
     source = Path(job["room"], "cleanrl", "source")
     script, change = source / "cleanrl" / f"{job['algorithm']}.py", job["settings"].pop("change", ("", ""))
     fixed = {"env_id": "Atlas-v0", "seed": reader.seed, "total_timesteps": job["steps"], "cuda": False}
@@ -126,20 +151,63 @@ def cleanrl(job: dict[str, Any], reader: Reader) -> Saved:
     def network() -> Any:
         return space["q_network"] if job["algorithm"] == "dqn" else space["agent"].actor
 
-    def greedy(rows: np.ndarray) -> Any:
-        with torch.no_grad():
-            return network()(torch.tensor(rows)).argmax(dim=1).numpy()
-
-    def saved(path: str) -> Greedy:
-        torch.save(network().state_dict(), path)
-        for parameter in network().parameters():
-            parameter.data.zero_()
-        network().load_state_dict(torch.load(path))
-        return greedy
-
-    reader.greedy = greedy
+    saved = of_torch(reader, network)
     sys.path.insert(0, str(source))
     exec(compile(script.read_text("utf-8").replace(*change), str(script), "exec"), space)
+    return saved
+
+
+def orthogonal(network: Any, last: float) -> Any:
+    """First weights as Stable-Baselines3's PPO has them, which these libraries leave to their users."""
+    from torch import nn
+
+    layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
+    for layer in layers:
+        nn.init.orthogonal_(layer.weight, last if layer is layers[-1] else 2**0.5)
+        nn.init.zeros_(layer.bias)
+    return network
+
+
+def tianshou(job: dict[str, Any], reader: Reader) -> Saved:
+    """Tianshou's algorithms in its own trainers."""
+    import torch
+    from tianshou import algorithm, data, env, trainer
+    from tianshou.algorithm import modelfree, optim
+    from tianshou.utils.net import common, discrete
+
+    s = SimpleNamespace(**{"n_envs": 1, "learning_starts": 0} | job["settings"])
+    np.random.seed(reader.seed)
+    torch.manual_seed(reader.seed)
+    envs = env.DummyVectorEnv([lambda: gym.make("Atlas-v0")] * s.n_envs)
+    envs.seed(reader.seed)
+    space, shape = envs.action_space[0], {"state_shape": reader.rows.shape[1], "hidden_sizes": s.net_arch}
+    if job["algorithm"] == "dqn":
+        network, adam = common.Net(**shape, action_shape=space.n), optim.AdamOptimizerFactory(s.learning_rate)
+        policy = modelfree.dqn.DiscreteQLearningPolicy(model=network, action_space=space)
+        own = {"gamma": s.gamma, "target_update_freq": s.target_update_interval // s.train_freq}
+        learner = algorithm.DQN(policy=policy, optim=adam, is_double=False, huber_loss_delta=1.0, **own)
+        params, size, frames = trainer.OffPolicyTrainerParams, s.buffer_size, s.train_freq
+        run = {"training_fn": lambda _, step: policy.set_eps_training(epsilon(job, step + s.learning_starts))}
+        run |= {"update_step_num_gradient_steps_per_sample": 1 / frames}
+    else:
+        bodies = [common.Net(**shape, activation=torch.nn.Tanh) for _ in range(2)]
+        network = discrete.DiscreteActor(preprocess_net=bodies[0], action_shape=space.n, softmax_output=False)
+        critic = orthogonal(discrete.DiscreteCritic(preprocess_net=bodies[1]), 1.0)
+        policy = modelfree.reinforce.DiscreteActorPolicy(actor=orthogonal(network, 0.01), action_space=space)
+        adam = optim.AdamOptimizerFactory(s.learning_rate, eps=1e-5)
+        own = {"gamma": s.gamma, "gae_lambda": s.gae_lambda, "max_grad_norm": s.max_grad_norm}
+        own |= {"eps_clip": s.clip_range, "ent_coef": s.ent_coef, "vf_coef": s.vf_coef}
+        learner = algorithm.PPO(policy=policy, critic=critic, optim=adam, **own)
+        params, size = trainer.OnPolicyTrainerParams, s.n_steps * s.n_envs
+        run, frames = {"update_step_num_repetitions": s.n_epochs}, size
+    saved = of_torch(reader, lambda: network, lambda net, rows: net(rows)[0])
+    collector = data.Collector(learner, envs, data.VectorReplayBuffer(size, s.n_envs), exploration_noise=True)
+    collector.reset()
+    if s.learning_starts:
+        collector.collect(n_step=s.learning_starts, random=True)
+    run |= {"epoch_num_steps": job["steps"] - s.learning_starts, "collection_step_num_env_steps": frames}
+    run |= {"training_collector": collector, "max_epochs": 1, "show_progress": False, "verbose": False}
+    learner.run_training(params(batch_size=s.batch_size, **run))
     return saved
 
 
