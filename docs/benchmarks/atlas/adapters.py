@@ -211,6 +211,52 @@ def tianshou(job: dict[str, Any], reader: Reader) -> Saved:
     return saved
 
 
+def torchrl(job: dict[str, Any], reader: Reader) -> Saved:
+    """TorchRL's losses and collector in its own trainers."""
+    import torch
+    from tensordict.nn import TensorDictModule, TensorDictSequential
+    from torchrl import collectors, data, envs, modules, objectives
+    from torchrl.trainers import algorithms
+
+    s = SimpleNamespace(**{"n_envs": 1, "learning_starts": None, "max_grad_norm": 10.0} | job["settings"])
+    torch.manual_seed(reader.seed)
+    many = envs.SerialEnv(s.n_envs, lambda: envs.GymEnv("Atlas-v0", categorical_action_encoding=True))
+    many.set_seed(reader.seed)
+    spec, shape = many.action_spec_unbatched, {"in_features": reader.rows.shape[1], "num_cells": s.net_arch}
+    if job["algorithm"] == "dqn":
+        network = modules.MLP(**shape, out_features=spec.n, activation_class=torch.nn.ReLU)
+        actor = modules.QValueActor(network, spec=spec, action_space="categorical")
+        loss = objectives.DQNLoss(actor, loss_function="smooth_l1", action_space="categorical")
+        loss.make_value_estimator(gamma=s.gamma)
+        often = s.target_update_interval // s.train_freq - 1  # it copies in every (N + 1)-st update
+        target = objectives.HardUpdate(loss, value_network_update_interval=often)
+        annealing = job["steps"] * s.exploration_fraction, s.exploration_initial_eps, s.exploration_final_eps
+        noise = modules.EGreedyModule(spec, *annealing)
+        policy, sampler, adam_eps = TensorDictSequential(actor, noise), data.RandomSampler(), 1e-8
+        own = {"target_net_updater": target, "greedy_module": noise, "optim_steps_per_batch": 1}
+        trainer, size, frames = algorithms.DQNTrainer, s.buffer_size, s.train_freq
+    else:
+        nets = [modules.MLP(**shape, out_features=n, activation_class=torch.nn.Tanh) for n in (spec.n, 1)]
+        network, critic = orthogonal(nets[0], 0.01), modules.ValueOperator(orthogonal(nets[1], 1.0))
+        logits = TensorDictModule(network, ["observation"], ["logits"])
+        kind = {"distribution_class": torch.distributions.Categorical, "return_log_prob": True}
+        policy = modules.ProbabilisticActor(logits, ["logits"], spec=spec, **kind)
+        own = {"clip_epsilon": s.clip_range, "entropy_coeff": s.ent_coef, "critic_coeff": s.vf_coef}
+        loss = objectives.ClipPPOLoss(policy, critic, loss_critic_type="l2", normalize_advantage=True, **own)
+        gae = objectives.value.GAE(gamma=s.gamma, lmbda=s.gae_lambda, value_network=critic)
+        own = {"gae": gae, "num_epochs": s.n_epochs, "optim_steps_per_batch": None}
+        trainer, size, frames = algorithms.PPOTrainer, s.n_steps * s.n_envs, s.n_steps * s.n_envs
+        sampler, adam_eps = data.SamplerWithoutReplacement(), 1e-5
+    saved = of_torch(reader, lambda: network)
+    take = {"frames_per_batch": frames, "total_frames": job["steps"], "init_random_frames": s.learning_starts}
+    storage = {"storage": data.LazyTensorStorage(size), "sampler": sampler, "batch_size": s.batch_size}
+    own |= {"replay_buffer": data.TensorDictReplayBuffer(**storage), "loss_module": loss, "frame_skip": 1}
+    own |= {"optimizer": torch.optim.Adam(loss.parameters(), lr=s.learning_rate, eps=adam_eps)}
+    own |= {"collector": collectors.Collector(many, policy, **take), "total_frames": job["steps"]}
+    trainer(**own, clip_norm=s.max_grad_norm, progress_bar=False, enable_logging=False).train()
+    return saved
+
+
 def engine(job: dict[str, Any], reader: Reader) -> None:
     """This package, all seeds as one population: its learning curve is exact already."""
     import gridworld

@@ -105,6 +105,7 @@ class Library(NamedTuple):
 _OLD = "gymnasium==0.29.1 numpy==1.26.4 tyro==1.0.17 tensorboard==2.21.0 torch==2.13.0"
 _CLEANRL = ("https://github.com/vwxyzjn/cleanrl", "fe8d8a03c41a7ef5b523e2e354bd01c363e786bb")
 _NEW, _TORCH = "numpy==2.4.6 torch==2.13.0", "torch gymnasium numpy"
+_TENSORS = "tensordict==0.14.3 gymnasium==1.4.0"
 _WEIGHTS = {"policy_kwargs": {"net_arch": [64, 64], "ortho_init": False}}  # torch's own first ones
 LIBRARIES = {
     "sb3": Library(f"stable_baselines3 {_TORCH}", "dqn ppo a2c"),
@@ -116,6 +117,7 @@ LIBRARIES = {
     "sb3+weights": Library(f"stable_baselines3 {_TORCH}", "ppo", more=_WEIGHTS),
     "cleanrl+l1": Library(f"{_TORCH} commit", "dqn", _OLD, _CLEANRL, {"change": ("F.mse", "F.smooth_l1")}),
     "tianshou": Library(f"tianshou {_TORCH}", "dqn ppo", f"tianshou==2.0.1 gymnasium==1.4.0 {_NEW}"),
+    "torchrl": Library(f"torchrl tensordict {_TORCH}", "dqn ppo", f"torchrl==0.14.1 {_TENSORS} {_NEW}"),
 }
 
 # Steps, and N, of which the number of environments is a divisor.
