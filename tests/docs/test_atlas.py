@@ -158,8 +158,8 @@ def test_workers_step_as_the_world_does(atlas: Any, name: str) -> None:
 def test_bad_input_is_a_sentence(atlas: Any, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^--worlds moon: must be among classic, "):
         atlas.main(["implementations", "sb3", "--worlds", "moon"])
-    with pytest.raises(InputError, match=r"^rllib: must be among sb3, "):
-        atlas.main(["implementations", "rllib"])
+    with pytest.raises(InputError, match=r"^rejax: must be among sb3, "):
+        atlas.main(["implementations", "rejax"])
     with pytest.raises(
         InputError, match=r"^sbx: is not installed; run python docs/benchmarks/atlas install sbx$"
     ):

@@ -8,6 +8,7 @@ in every N-th step, before the update after it, as the engine's curve does; a li
 
 import importlib
 import json
+import math
 import os
 import sys
 import tempfile
@@ -254,6 +255,39 @@ def torchrl(job: dict[str, Any], reader: Reader) -> Saved:
     own |= {"optimizer": torch.optim.Adam(loss.parameters(), lr=s.learning_rate, eps=adam_eps)}
     own |= {"collector": collectors.Collector(many, policy, **take), "total_frames": job["steps"]}
     trainer(**own, clip_norm=s.max_grad_norm, progress_bar=False, enable_logging=False).train()
+    return saved
+
+
+def rllib(job: dict[str, Any], reader: Reader) -> Saved:
+    """RLlib's algorithms on its new API stack, all in this process."""
+    from ray.rllib.algorithms import dqn, ppo
+
+    s = SimpleNamespace(**{"n_envs": 1, "train_freq": "auto"} | job["settings"])
+    if job["algorithm"] == "dqn":
+        config, (ask, key), net = dqn.DQNConfig(), ("compute_q_values", "qf_preds"), {}
+        own = {"train_batch_size_per_learner": s.batch_size, "grad_clip": 10.0, "double_q": False}
+        own |= {"target_network_update_freq": s.target_update_interval, "tau": s.tau, "dueling": False}
+        own |= {"num_steps_sampled_before_learning_starts": s.learning_starts}
+        own |= {"epsilon": [(step, epsilon(job, step)) for step in (0, job["steps"])]}
+        own |= {"replay_buffer_config": {"type": "EpisodeReplayBuffer", "capacity": s.buffer_size}}
+    else:
+        config, (ask, key) = ppo.PPOConfig(), ("forward_inference", "action_dist_inputs")
+        net = {"fcnet_kernel_initializer": "orthogonal_", "fcnet_kernel_initializer_kwargs": {"gain": 2**0.5}}
+        own = {"train_batch_size_per_learner": s.n_steps * s.n_envs, "minibatch_size": s.batch_size}
+        own |= {"lambda_": s.gae_lambda, "clip_param": s.clip_range, "entropy_coeff": s.ent_coef}
+        own |= {"vf_loss_coeff": s.vf_coef, "num_epochs": s.n_epochs, "grad_clip": s.max_grad_norm}
+        own |= {"use_kl_loss": False, "vf_clip_param": math.inf}
+        net["vf_share_layers"] = False
+    net |= {"fcnet_activation": "tanh" if net else "relu", "fcnet_hiddens": s.net_arch}
+    config.environment("Atlas-v0", disable_env_checking=True).rl_module(model_config=net)
+    config.training(lr=s.learning_rate, gamma=s.gamma, grad_clip_by="global_norm", **own)
+    collect = {"num_envs_per_env_runner": s.n_envs, "rollout_fragment_length": s.train_freq}
+    learner = config.env_runners(num_env_runners=0, **collect).debugging(seed=reader.seed).build_algo()
+    if job["algorithm"] == "dqn":
+        learner.local_replay_buffer.rng = np.random.default_rng(reader.seed)  # has no seed of its own
+    saved = of_torch(reader, learner.get_module, lambda net, rows: getattr(net, ask)({"obs": rows})[key])
+    while reader.count < job["steps"]:
+        learner.train()
     return saved
 
 

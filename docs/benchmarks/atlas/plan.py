@@ -118,6 +118,7 @@ LIBRARIES = {
     "cleanrl+l1": Library(f"{_TORCH} commit", "dqn", _OLD, _CLEANRL, {"change": ("F.mse", "F.smooth_l1")}),
     "tianshou": Library(f"tianshou {_TORCH}", "dqn ppo", f"tianshou==2.0.1 gymnasium==1.4.0 {_NEW}"),
     "torchrl": Library(f"torchrl tensordict {_TORCH}", "dqn ppo", f"torchrl==0.14.1 {_TENSORS} {_NEW}"),
+    "rllib": Library(f"ray {_TORCH}", "dqn ppo", f"ray[rllib]==2.60.0 gymnasium==1.2.2 {_NEW}"),
 }
 
 # Steps, and N, of which the number of environments is a divisor.
