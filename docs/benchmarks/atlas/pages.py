@@ -14,7 +14,7 @@ from rows import Row
 from scipy import stats
 
 from gridworld.report import statistics
-from gridworld.report.chart import compact, house_style, styles
+from gridworld.report.chart import INK, compact, house_style, styles
 
 SEED = 0  # of the bootstrap
 _LEVEL = 0.05  # of each one-sided test
@@ -215,6 +215,42 @@ def _defaults(found: list[Group], figures: Path) -> dict[str, str]:
     ]
     named = [" ".join(kind) for kind in sorted(kinds)]
     return {
+        "figure": _map(kinds, figures) if kinds else "No rows yet.",
         "results": _table(head, lines, 2),
         "worlds": _table(("world", "chance", "states", "steps of the optimum", *named), places, 2),
     }
+
+
+def _map(kinds: dict[tuple[str, str], list[Group]], figures: Path) -> str:
+    """A panel for each algorithm: its worlds by their size and how far their goal is."""
+    with house_style("defaults"):
+        size = (2.7 * len(kinds) + 1.1, 3.2)
+        figure, axes = plt.subplots(
+            1, len(kinds), squeeze=False, sharey=True, figsize=size, layout="constrained"
+        )
+        for axis, (kind, own) in zip(axes.flat, sorted(kinds.items()), strict=True):
+            axis.set(title=" ".join(kind), xlabel="steps of the optimum", xscale="log", yscale="log")
+            axis.set(xticks=[1, 3, 10, 30, 100], yticks=[10, 30, 100, 300], xlim=(0.8, 120), ylim=(4, 700))
+            axis.minorticks_off()
+            axis.xaxis.set_major_formatter(compact)
+            axis.yaxis.set_major_formatter(compact)
+            for is_stochastic, marker, label in ((False, "o", "without chance"), (True, "^", "with chance")):
+                some = [group for group in own if group.world.mdp.is_stochastic == is_stochastic]
+                far = [evaluator(group.world, DISCOUNT).optimum.expected_length for group in some]
+                sizes = [group.world.mdp.num_states for group in some]
+                shares = [group.certified.count / group.certified.total for group in some]
+                shown = {
+                    "c": shares,
+                    "cmap": "viridis",
+                    "vmin": 0,
+                    "vmax": 1,
+                    "edgecolors": INK,
+                    "linewidths": 0.6,
+                }
+                dots = axis.scatter(far, sizes, marker=marker, s=46, label=label, **shown)
+        axes[0, 0].set_ylabel("states")
+        figure.legend(*axis.get_legend_handles_labels(), loc="outside upper left", ncols=2)
+        figure.colorbar(dots, ax=axes, label="share certified for good")
+        figure.savefig(figures / "atlas_defaults.svg", metadata={"Date": None})
+    plt.close(figure)
+    return "![Worlds by size, distance and share of certified runs](../data/atlas_defaults.svg)"
