@@ -231,7 +231,7 @@ def torchrl(job: dict[str, Any], reader: Reader) -> Saved:
         loss.make_value_estimator(gamma=s.gamma)
         often = s.target_update_interval // s.train_freq - 1  # it copies in every (N + 1)-st update
         target = objectives.HardUpdate(loss, value_network_update_interval=often)
-        annealing = job["steps"] * s.exploration_fraction, s.exploration_initial_eps, s.exploration_final_eps
+        annealing = s.exploration_initial_eps, s.exploration_final_eps, job["steps"] * s.exploration_fraction
         noise = modules.EGreedyModule(spec, *annealing)
         policy, sampler, adam_eps = TensorDictSequential(actor, noise), data.RandomSampler(), 1e-8
         own = {"target_net_updater": target, "greedy_module": noise, "optim_steps_per_batch": 1}

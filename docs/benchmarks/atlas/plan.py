@@ -218,7 +218,7 @@ def python_of(library: str) -> Path:
     room = ROOM / library.partition("+")[0]
     python = room / "bin" / "python" if LIBRARIES[library].pins else Path(sys.executable)
     if not python.exists():
-        raise InputError(f"{library}: is not installed; run python docs/benchmarks/atlas install {library}")
+        raise InputError(f"{library}: is not installed; run python docs/benchmarks/atlas install {room.name}")
     return python
 
 
