@@ -13,7 +13,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from gridworld.base.bounds import STEP_LIMIT, Bounds, Discount
@@ -167,11 +166,7 @@ def _made(name: str, make: Make) -> Env:
     except Exception as error:  # anybody's code
         reason = str(error) if isinstance(error, InputError) else f"cannot be made ({in_short(error)})"
         raise InputError(f"examine {name}: {reason}") from error
-    as_environment(f"examine {name}", env)
-    for what in ("observation_space", "action_space"):
-        if not isinstance(getattr(env, what, None), spaces.Space):
-            raise InputError(f"examine {name}: its {what} is not a gymnasium space")
-    return env
+    return as_environment(f"examine {name}", env)
 
 
 def _first_look(env: Env, make: Make, seed: int) -> str:

@@ -318,6 +318,7 @@ class Branching:
         return self._counted("geometric", p, size)
 
     def _counted(self, name: str, parameter: Any, size: Any) -> Any:
+        """Whole numbers that have no bound."""
         if np.ndim(parameter):
             self.refuse(f"{name}() with arrays cannot be enumerated")
         self._check(name, parameter, size)

@@ -13,7 +13,6 @@ from fractions import Fraction
 from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn
 
-import gymnasium as gym
 import numpy as np
 
 from gridworld.base.errors import InputError
@@ -88,17 +87,6 @@ def _steps(search: Search, kind: type, numbers: np.random.Generator) -> Iterator
         yield search.seen.digest(observation), np.asarray(reward, np.float64).tobytes(), *map(bool, over)
         if any(over):
             return
-
-
-def check_spaces(search: Search) -> None:
-    """An environment must say what it shows and what it takes."""
-    for name in ("observation_space", "action_space"):
-        try:
-            is_space = isinstance(getattr(search.env, name), gym.Space)
-        except Exception:  # whatever its own code raises
-            is_space = False
-        if not is_space:
-            raise search.refusal(f"its {name} is not a gymnasium space")
 
 
 def check_walks(search: Search, shown: list[Any]) -> None:

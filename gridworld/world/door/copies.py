@@ -109,11 +109,6 @@ def _is_taken_apart(kind: Any) -> bool:
         return False
     if issubclass(kind, gym.Env):
         return True
-    ways = (
-        "__getstate__",
-        "__reduce__",
-        "__reduce_ex__",
-        "__getattr__",
-    )  # which pickle asks before it is whole
+    ways = ("__getstate__", "__reduce__", "__reduce_ex__", "__getattr__")
     has_its_own = any(getattr(kind, name, None) is not getattr(object, name, None) for name in ways)
     return has_its_own and not (is_library(kind.__module__) or issubclass(kind, _CONTAINERS))

@@ -28,7 +28,6 @@ from gridworld.world.door.checks import (
     check_by_episodes,
     check_by_word,
     check_ignored,
-    check_spaces,
     check_walks,
     walk,
 )
@@ -75,7 +74,6 @@ class Search:
         self._compares, self._kept = compares, 1 if keeps_copies else SAMPLED  # the copy of one in so many
         self.is_by_word = state is not None
         self._read = state or known.state_reader(env.unwrapped)
-        check_spaces(self)
         actions = env.action_space
         if not isinstance(actions, spaces.Discrete) or actions.start != 0 or actions.n > MOST_ACTIONS:
             raise self.refusal(

@@ -171,8 +171,15 @@ def _registered(where: str, env_id: str, name: str) -> tuple[Callable[..., Any],
 
 
 def as_environment(where: str, made: Any, wanted: str = "a gymnasium.Env") -> Env:
-    """What somebody's code made, which must be an environment of Gymnasium."""
+    """What somebody's code made, which must be an environment of Gymnasium, with its spaces."""
     if isinstance(made, gym.Env):
+        for name in ("observation_space", "action_space"):
+            try:
+                is_space = isinstance(getattr(made, name), gym.Space)
+            except Exception:  # whatever its own code raises
+                is_space = False
+            if not is_space:
+                raise InputError(f"{where}: its {name} is not a gymnasium space")
         return made
     is_old = any(kind.__module__.partition(".")[0] == "gym" for kind in type(made).__mro__)
     kind = type(made).__name__
